@@ -1,0 +1,319 @@
+"""What a configuration file may say. Every key's name carries its unit; unknown keys are refused."""
+
+import math
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Final, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from drivers.frame import WORST_CASE_BITS
+from drivers.nmt import MAX_NODE_ID
+
+CYCLIC_FRAME_BYTES: Final = 8
+"""RPDO and TPDO each carry a word, a position and a torque."""
+MAX_BUS_LOAD: Final = 0.9
+"""Share of the cycle that SYNC and PDOs may take at worst-case stuffing; the rest is SDO, heartbeats and EMCY."""
+
+Millimetres = Annotated[float, Field(ge=1.0, le=10_000.0)]
+Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
+Point = Annotated[tuple[float, float], Field()]
+AxisName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+
+
+class Model(BaseModel):
+    """Base of every section: frozen, no unknown keys, no NaN, no silent conversion from text."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
+
+
+class FiveBarSection(Model):
+    """Link lengths and pivots of the five-bar, in the paper's letters."""
+
+    p_mm: Millimetres
+    q_mm: Millimetres
+    r_mm: Millimetres
+    s_mm: Millimetres
+    cv_pivot_mm: Point = (0.0, 0.0)
+    servo_pivot_mm: Point
+
+
+class LinkSection(Model):
+    """A link as a rigid body; ``com_m`` is measured along the link from its first joint (see mechanism.dynamics)."""
+
+    mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)]
+    com_m: Annotated[float, Field(ge=-10.0, le=10.0)]
+    com_perp_m: Annotated[float, Field(ge=-10.0, le=10.0)] = 0.0
+    inertia_com_kgm2: Annotated[float, Field(ge=0.0, le=1000.0)]
+
+
+class LinksSection(Model):
+    """The four moving links."""
+
+    p: LinkSection
+    q: LinkSection
+    r: LinkSection
+    s: LinkSection
+
+
+class MachineSection(Model):
+    """The linkage, its masses, and the plane that it stands in."""
+
+    five_bar: FiveBarSection
+    links: LinksSection
+    end_effector_mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    gravity_m_s2: Point = (0.0, -9.80665)
+    minimum_transmission_sine: Annotated[float, Field(ge=0.01, le=0.9)] = 0.1
+    """Least sine of the angles between q and r and between r and s: the distance kept to singular positions."""
+
+
+class MotionSection(Model):
+    """What the machine is to do."""
+
+    curve: str
+    """CSV file of the desired curve, relative to the configuration file."""
+    speed_rpm: Annotated[float, Field(gt=0.0, le=6000.0)]
+    machine_cycles: Annotated[int, Field(ge=1, le=1_000_000)] = 10
+    ramp_acceleration_rad_per_s2: Positive
+    ramp_jerk_rad_per_s3: Positive
+    cam_points: Annotated[int, Field(ge=64, le=65536)] = 1024
+    structural_error_limit_mm: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.5
+
+    @model_validator(mode="after")
+    def _points_are_a_power_of_two(self) -> Self:
+        if self.cam_points & (self.cam_points - 1):
+            raise ValueError(f"cam_points: {self.cam_points} is not a power of two")
+        return self
+
+
+class IdentitySection(Model):
+    """Identity object 1018h as it must be; a part that is left out is not checked."""
+
+    vendor_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    product_code: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    revision_number: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+    serial_number: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
+
+
+class LimitsSection(Model):
+    """What the axis may do at most; cam and ramps are checked against it before anything moves."""
+
+    position_deg: tuple[float, float] | None = None
+    velocity_rad_per_s: Positive
+    acceleration_rad_per_s2: Positive
+    jerk_rad_per_s3: Positive | None = None
+    following_error_counts: Annotated[int, Field(ge=1, le=0x7FFFFFFF)]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.position_deg is not None and self.position_deg[0] >= self.position_deg[1]:
+            raise ValueError(f"position_deg: {self.position_deg[0]:g} is not below {self.position_deg[1]:g}")
+        return self
+
+
+class GainsSection(Model):
+    """Gains of the paper's eq. (5), integers over 256 (eq. 6)."""
+
+    K_P: Annotated[int, Field(ge=0, le=65535)]
+    K_I: Annotated[int, Field(ge=0, le=65535)] = 0
+    K_D: Annotated[int, Field(ge=0, le=65535)] = 0
+    K_V: Annotated[int, Field(ge=0, le=65535)] = 0
+    K_F: Annotated[int, Field(ge=0, le=65535)] = 0
+
+
+class EmulatedDriveSection(Model):
+    """Motor and amplifier of the emulated drive; a gateway against real drives does not read it."""
+
+    gains: GainsSection
+    torque_per_volt_Nm: Positive
+    torque_time_constant_s: Annotated[float, Field(ge=1e-5, le=1.0)]
+    torque_limit_Nm: Positive
+    inertia_kgm2: Positive
+    coulomb_Nm: NotNegative = 0.0
+    viscous_Nms: NotNegative = 0.0
+    brake_torque_Nm: NotNegative
+    resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+
+
+class Role(Enum):
+    """Which link an axis drives."""
+
+    MASTER = "master"
+    SLAVE = "slave"
+
+
+class AxisSection(Model):
+    """One drive on the bus, and the axis that it moves."""
+
+    role: Role
+    node_id: Annotated[int, Field(ge=1, le=MAX_NODE_ID)]
+    identity: IdentitySection = IdentitySection()
+    counts_per_revolution: Annotated[int, Field(ge=16, le=1 << 24)] = 4096
+    home_angle_deg: Annotated[float, Field(ge=-3600.0, le=3600.0)] = 0.0
+    """Angle of the link where the axis is homed, so where its position actual value is 0."""
+    homing_method: Literal[35, 37] | None = 37
+    """CiA 402 homing on the current position; null leaves the drive's zero as it is."""
+    rated_torque_Nm: Positive
+    limits: LimitsSection
+    emulation: EmulatedDriveSection
+
+
+class BusSection(Model):
+    """Where the drives are, and how often they are spoken to."""
+
+    interface: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,32}$")] = "auto"
+    """auto: socketcan on ``channel`` where that interface is up, else socketcand at ``host``:``port``."""
+    channel: Annotated[str, Field(min_length=1, max_length=64)] = "vcan0"
+    host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 29536
+    bit_rate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    cycle_us: Annotated[int, Field(ge=200, le=1_000_000)] = 1000
+    gateway_node_id: Annotated[int, Field(ge=1, le=MAX_NODE_ID)] = 127
+    """Node id under which the gateway sends its own heartbeat."""
+    heartbeat_ms: Annotated[int, Field(ge=1, le=30_000)] = 50
+    """Period of all heartbeats, the gateway's and the drives'."""
+    heartbeat_timeout_ms: Annotated[int, Field(ge=2, le=60_000)] = 200
+    boot_up_timeout_s: Annotated[float, Field(gt=0.0, le=60.0)] = 2.0
+
+    def interpolation_time(self) -> tuple[int, int] | None:
+        """The cycle as 60C2h says it: value 1..255 and power of ten in seconds, None if it cannot be said."""
+        value, exponent = self.cycle_us, -6
+        while value % 10 == 0:
+            value, exponent = value // 10, exponent + 1
+        return (value, exponent) if value <= 255 else None
+
+    def load(self, axes: int) -> float:
+        """Share of the cycle that SYNC and two PDOs an axis take at worst-case bit stuffing."""
+        bits = WORST_CASE_BITS[0] + 2 * axes * WORST_CASE_BITS[CYCLIC_FRAME_BYTES]
+        return bits / self.bit_rate / (self.cycle_us * 1e-6)
+
+
+class Reaction(Enum):
+    """What the gateway does when a guarded condition holds."""
+
+    WARN = "warn"
+    CONTROLLED_STOP = "controlled_stop"
+    QUICK_STOP = "quick_stop"
+
+
+class ConditionSection(Model):
+    """A guarded condition: how many cycles in a row it must hold, and what is then done."""
+
+    persistence_cycles: Annotated[int, Field(ge=1, le=100_000)] = 1
+    reaction: Reaction
+
+
+class GuardSection(Model):
+    """Every condition that the cycle watches, each with one reaction."""
+
+    following_error: ConditionSection = ConditionSection(persistence_cycles=1, reaction=Reaction.QUICK_STOP)
+    missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=Reaction.CONTROLLED_STOP)
+    missed_deadline: ConditionSection = ConditionSection(persistence_cycles=20, reaction=Reaction.CONTROLLED_STOP)
+    emergency: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
+    drive_fault: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
+    heartbeat_lost: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
+
+
+class EmulatorSection(Model):
+    """The emulated machine as a whole."""
+
+    eds: str = "eds/sim_drive.eds"
+    sub_steps: Annotated[int, Field(ge=1, le=100)] = 4
+    missing_sync_limit: Annotated[int, Field(ge=1, le=1000)] = 20
+    """SYNC periods without a SYNC after which an enabled drive faults."""
+
+
+class GatewayConfig(Model):
+    """A whole configuration file."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+    description: Annotated[str, Field(max_length=2000)] = ""
+    machine: MachineSection
+    motion: MotionSection
+    axes: Annotated[dict[AxisName, AxisSection], Field(min_length=2, max_length=2)]
+    bus: BusSection = BusSection()
+    guard: GuardSection = GuardSection()
+    emulator: EmulatorSection = EmulatorSection()
+    _path: Path = Path()
+    _text: str = ""
+
+    @property
+    def path(self) -> Path:
+        """File that the configuration was read from."""
+        return self._path
+
+    @property
+    def text(self) -> str:
+        """The file's text as it was read, for the recording."""
+        return self._text
+
+    @property
+    def axis_names(self) -> tuple[str, ...]:
+        """The axes, master first: the order in which samples and frames have them."""
+        return tuple(sorted(self.axes, key=lambda name: self.axes[name].role is not Role.MASTER))
+
+    @property
+    def ordered_axes(self) -> tuple[AxisSection, ...]:
+        """The axes in the order of ``axis_names``."""
+        return tuple(self.axes[name] for name in self.axis_names)
+
+    @property
+    def cycle_s(self) -> float:
+        """The cycle in seconds."""
+        return self.bus.cycle_us * 1e-6
+
+    @property
+    def speed_rad_per_s(self) -> float:
+        """Speed of the CV axis."""
+        return self.motion.speed_rpm * 2.0 * math.pi / 60.0
+
+    def relative(self, name: str) -> Path:
+        """A file that the configuration names: beside it, or the shipped one of that name."""
+        beside = self._path.parent / name
+        return beside if beside.exists() else Path(__file__).parent / name
+
+    @model_validator(mode="after")
+    def _cross_check(self) -> Self:
+        roles = [axis.role for axis in self.axes.values()]
+        if roles.count(Role.MASTER) != 1 or roles.count(Role.SLAVE) != 1:
+            raise ValueError("axes: there must be one axis with role master and one with role slave")
+        users: dict[int, str] = {self.bus.gateway_node_id: "bus.gateway_node_id"}
+        for name, axis in self.axes.items():
+            if axis.node_id in users:
+                raise ValueError(
+                    f"axes.{name}.node_id: {axis.node_id} is taken by {users[axis.node_id]}, every node id must be unique"
+                )
+            users[axis.node_id] = f"axes.{name}"
+        if self.bus.interpolation_time() is None:
+            raise ValueError(
+                f"bus.cycle_us: {self.bus.cycle_us} cannot be said in 60C2h, which takes 1 to 255 times a power of ten"
+            )
+        if self.bus.heartbeat_ms * 1000 <= self.bus.cycle_us:
+            raise ValueError(
+                f"bus.heartbeat_ms: {self.bus.heartbeat_ms} ms is not longer than the cycle of {self.bus.cycle_us} us"
+            )
+        if self.bus.heartbeat_timeout_ms < 2 * self.bus.heartbeat_ms:
+            raise ValueError(
+                f"bus.heartbeat_timeout_ms: {self.bus.heartbeat_timeout_ms} is below twice heartbeat_ms "
+                f"({self.bus.heartbeat_ms}), a single late heartbeat would stop the machine"
+            )
+        load = self.bus.load(len(self.axes))
+        if load > MAX_BUS_LOAD:
+            raise ValueError(
+                f"bus.cycle_us: {self.bus.cycle_us} us is too short for {len(self.axes)} axes at "
+                f"{self.bus.bit_rate} bit/s, SYNC and PDOs would take {load:.0%} of it (bound {MAX_BUS_LOAD:.0%})"
+            )
+        speed_limit = self.axes[self.axis_names[0]].limits.velocity_rad_per_s
+        if self.speed_rad_per_s > speed_limit:
+            raise ValueError(
+                f"motion.speed_rpm: {self.motion.speed_rpm:g} is {self.speed_rad_per_s:.3f} rad/s, above "
+                f"axes.{self.axis_names[0]}.limits.velocity_rad_per_s {speed_limit:g}"
+            )
+        acceleration_limit = self.axes[self.axis_names[0]].limits.acceleration_rad_per_s2
+        if self.motion.ramp_acceleration_rad_per_s2 > acceleration_limit:
+            raise ValueError(
+                f"motion.ramp_acceleration_rad_per_s2: {self.motion.ramp_acceleration_rad_per_s2:g} is above "
+                f"axes.{self.axis_names[0]}.limits.acceleration_rad_per_s2 {acceleration_limit:g}"
+            )
+        return self
