@@ -79,7 +79,8 @@ class VirtualBus:
         """Put ``nodes`` on a bus of ``bit_rate`` bit/s at ``start_ns``.
 
         ``trace(now_ns, frame)`` sees every delivery (a lost frame never, a doubled one twice) before the nodes do;
-        ``on_event(node_index, event)`` gets the events of the nodes. Without ``on_event`` the events stay in the nodes, for a caller who asks them himself.
+        ``on_event(node_index, event)`` gets the events of the nodes. Without ``on_event`` the events stay in the nodes,
+        for a caller who asks them himself.
 
         Raises:
             ValueError: ``bit_rate`` is not positive.
@@ -172,7 +173,7 @@ class VirtualBus:
             next_ns = self._frame_end_ns
         if self._late and self._late[0][0] < next_ns:
             next_ns = self._late[0][0]
-        return max(next_ns, self._now_ns)
+        return next_ns if next_ns > self._now_ns else self._now_ns
 
     def _run_instant(self, now_ns: int) -> None:
         self._now_ns = now_ns
