@@ -1,0 +1,182 @@
+"""A SocketCAN raw socket with kernel time stamps, kernel filters and error frames."""
+
+import errno
+import os
+import select
+import socket
+import struct
+from collections.abc import Sequence
+from enum import IntFlag
+from typing import Final
+
+from drivers.arrival_clock import ArrivalClock
+from drivers.errors import BusError
+from drivers.frame import MAX_DATA_LENGTH, Frame
+
+# linux/can.h, linux/can/raw.h and asm-generic/socket.h; written out so that the module can be imported anywhere.
+_AF_CAN: Final = 29
+_CAN_RAW: Final = 1
+_SOL_CAN_RAW: Final = 101
+_CAN_RAW_FILTER: Final = 1
+_CAN_RAW_ERR_FILTER: Final = 2
+_CAN_EFF_FLAG: Final = 0x80000000
+_CAN_RTR_FLAG: Final = 0x40000000
+_CAN_ERR_FLAG: Final = 0x20000000
+_CAN_SFF_MASK: Final = 0x7FF
+_CAN_ERR_MASK: Final = 0x1FFFFFFF
+_SO_RCVBUFFORCE: Final = 33
+_SO_TIMESTAMPNS: Final = 35
+_SO_RXQ_OVFL: Final = 40
+
+_CAN_FRAME: Final = struct.Struct("=IB3x8s")
+_FILTER: Final = struct.Struct("=II")
+_TIMESPEC: Final = struct.Struct("@ll")
+_DROP_COUNT: Final = struct.Struct("@I")
+_ANCILLARY_BYTES: Final = 128
+_RECEIVE_BUFFER_BYTES: Final = 4 << 20
+_MAX_SKIPPED_FRAMES: Final = 64
+_QUEUE_FULL: Final = (errno.ENOBUFS, errno.EAGAIN)
+
+
+class BusErrorClass(IntFlag):
+    """What an error frame reports (linux/can/error.h)."""
+
+    TRANSMIT_TIMEOUT = 0x001
+    LOST_ARBITRATION = 0x002
+    CONTROLLER = 0x004
+    PROTOCOL = 0x008
+    TRANSCEIVER = 0x010
+    NO_ACKNOWLEDGE = 0x020
+    BUS_OFF = 0x040
+    BUS_ERROR = 0x080
+    RESTARTED = 0x100
+    COUNTERS = 0x200
+
+
+class SocketcanPort:
+    """Port on a SocketCAN network interface.
+
+    Frames of 29-bit identifiers are left in the kernel: CANopen has none. ``error_counts`` counts the error frames by
+    what they report, ``lost_frame_count`` the frames that the kernel had no room for; bus-off raises BusError.
+    """
+
+    def __init__(self, channel: str, filters: Sequence[tuple[int, int]] | None = None) -> None:
+        """Open the interface ``channel``; ``filters`` are pairs of COB-ID and mask, applied by the kernel.
+
+        Raises:
+            BusError: this kernel has no SocketCAN, there is no such interface, or it is down.
+        """
+        self.channel: Final = channel
+        self.error_counts: Final = dict.fromkeys(BusErrorClass, 0)
+        self.lost_frame_count = 0
+        self._socket = self._open(channel, filters)
+        self._clock: Final = ArrivalClock()
+
+    def _open(self, channel: str, filters: Sequence[tuple[int, int]] | None) -> socket.socket:
+        try:
+            can_socket = socket.socket(_AF_CAN, socket.SOCK_RAW, _CAN_RAW)
+        except OSError as error:
+            raise self._error(f"this system offers no SocketCAN ({error.strerror})") from None
+        try:
+            accepted = ((0, 0),) if filters is None else filters
+            can_socket.setsockopt(
+                _SOL_CAN_RAW,
+                _CAN_RAW_FILTER,
+                b"".join(
+                    _FILTER.pack(cob_id & _CAN_SFF_MASK, mask & _CAN_SFF_MASK | _CAN_EFF_FLAG)
+                    for cob_id, mask in accepted
+                ),
+            )
+            can_socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _CAN_ERR_MASK)
+            can_socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            can_socket.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+            try:
+                can_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER_BYTES)
+            except OSError:
+                can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_BYTES)
+            can_socket.setblocking(False)
+            can_socket.bind((channel,))
+            state = can_socket.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+        except OSError as error:
+            can_socket.close()
+            if error.errno == errno.ENODEV or "interface name" in str(error):
+                raise self._error("no such interface; 'ip -brief link' lists what there is") from None
+            raise self._error(f"cannot be opened ({error.strerror or error})") from None
+        if state:
+            can_socket.close()
+            reason = "down" if state == errno.ENETDOWN else f"unusable ({os.strerror(state)})"
+            raise self._error(f"the interface is {reason}; 'ip link set {channel} up' brings it up")
+        return can_socket
+
+    def send(self, frame: Frame) -> bool:
+        """See Port."""
+        data = frame.data
+        try:
+            self._socket.send(
+                _CAN_FRAME.pack(frame.cob_id | _CAN_RTR_FLAG if frame.is_remote else frame.cob_id, len(data), data)
+            )
+        except OSError as error:
+            if error.errno in _QUEUE_FULL:
+                return False
+            raise self._lost(error) from None
+        return True
+
+    def receive(self) -> tuple[Frame, int] | None:
+        """See Port."""
+        for _ in range(_MAX_SKIPPED_FRAMES):
+            try:
+                packet, ancillary, _, _ = self._socket.recvmsg(_CAN_FRAME.size, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                self._clock.queue_is_empty()
+                return None
+            except OSError as error:
+                raise self._lost(error) from None
+            identifier, length, data = _CAN_FRAME.unpack(packet)
+            stamp_ns = 0
+            for _, kind, value in ancillary:
+                if kind == _SO_TIMESTAMPNS:
+                    seconds, nanoseconds = _TIMESPEC.unpack(value)
+                    stamp_ns = seconds * 1_000_000_000 + nanoseconds
+                elif kind == _SO_RXQ_OVFL:
+                    (self.lost_frame_count,) = _DROP_COUNT.unpack(value)
+            if identifier & _CAN_ERR_FLAG:
+                self._count_error(identifier)
+                continue
+            if identifier & _CAN_RTR_FLAG:
+                frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
+            else:
+                frame = Frame(identifier & _CAN_SFF_MASK, data[: min(length, MAX_DATA_LENGTH)])
+            return frame, self._clock.arrival_ns(stamp_ns)
+        return None
+
+    def wait(self, timeout_s: float) -> bool:
+        """See Port."""
+        try:
+            return bool(select.select((self._socket,), (), (), timeout_s)[0])
+        except (OSError, ValueError) as error:
+            raise self._error(f"the socket is closed ({error})") from None
+
+    def fileno(self) -> int:
+        """See Port."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """See Port."""
+        self._socket.close()
+
+    def _count_error(self, identifier: int) -> None:
+        for error_class in BusErrorClass:
+            if identifier & error_class:
+                self.error_counts[error_class] += 1
+        if identifier & BusErrorClass.BUS_OFF:
+            raise self._error("the controller has gone bus-off; look at bit rate, wiring and termination")
+
+    def _lost(self, error: OSError) -> BusError:
+        if error.errno == errno.ENETDOWN:
+            return self._error("the interface has gone down")
+        if error.errno in (errno.ENODEV, errno.ENXIO):
+            return self._error("the interface has been removed")
+        return self._error(f"the interface has failed ({error.strerror or error})")
+
+    def _error(self, reason: str) -> BusError:
+        return BusError("socketcan", self.channel, reason)
