@@ -22,11 +22,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.errors import GatewayError
 from gateway.run_constants import RunConstants
 from gateway.sample import SampleArray, SampleLayout
 
@@ -54,8 +55,8 @@ FRAME_DTYPE: Final = np.dtype(
 FrameArray = NDArray[np.void]
 """Frames as a numpy structured array of ``FRAME_DTYPE``, shape (frames,)."""
 
-_FRAME_STRUCT: Final = struct.Struct("<qIBB8s2x")
-_FRAME_SIZE: Final = _FRAME_STRUCT.size
+FRAME_STRUCT: Final = struct.Struct("<qIBB8s2x")
+_FRAME_SIZE: Final = FRAME_STRUCT.size
 _EVENT_LENGTH: Final = struct.Struct("<I")
 # magic, version, header size, sample size, sample / frame / event capacity, length of the JSON, reserved
 _FIXED: Final = struct.Struct("<8s8I")
@@ -68,7 +69,7 @@ _PID, _PID_START, _SAMPLES, _FRAMES, _EVENTS, _STATE, _RESULT, _HEARTBEAT, _STOP
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-class RingError(Exception):
+class RingError(GatewayError):
     """A ring cannot be made or attached: ``path`` names it, ``reason`` says why."""
 
     def __init__(self, path: Path, reason: str) -> None:
@@ -98,10 +99,26 @@ class StopRequest(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class RunEvent:
     """Something that happened, as the loop told it: ``data`` is JSON-able and has at least ``at_ns`` and ``kind``."""
 
     data: Mapping[str, Any]
+
+
+class Sink(Protocol):
+    """Where the cyclic loop puts what it sees: the ring in real time, the recording itself in virtual time."""
+
+    def append(self, *values: float) -> None:
+        """Take one sample: the values of ``SampleLayout.pack_into``, in its order."""
+        ...
+
+    def append_frame(self, at_ns: int, cob_id: int, data: bytes, is_remote: bool = False) -> None:
+        """Take one CAN frame that was sent or received at ``at_ns``."""
+        ...
+
+    def append_event(self, at_ns: int, kind: str, text: str, **data: str | int | float | bool | None) -> None:
+        """Take one event. The event that ends a run carries ``stopped_by``."""
+        ...
 
 
 class _Mapping:
@@ -183,7 +200,7 @@ class RingWriter:
         self._sample_mask = mapping.sample_capacity - 1
         self._sample_offset = mapping.sample_offset
         self._samples: int = words[_SAMPLES]
-        self._pack_frame: Callable[..., None] = _FRAME_STRUCT.pack_into
+        self._pack_frame: Callable[..., None] = FRAME_STRUCT.pack_into
         self._frame_mask = mapping.frame_capacity - 1
         self._frame_offset = mapping.frame_offset
         self._frames: int = words[_FRAMES]
@@ -356,7 +373,7 @@ class RingReader:
             copied = copied[min(count, safe - first) :].copy()
         return copied, written, written - len(copied) - next_index
 
-    def read_new_events(self) -> tuple[list[Event], int]:
+    def read_new_events(self) -> tuple[list[RunEvent], int]:
         """Events since the last call, oldest first, and how many were lost."""
         mapping = self._mapping
         capacity = mapping.event_capacity
@@ -371,7 +388,7 @@ class RingReader:
         raw = raw[max(0, safe - first) :]
         lost = written - len(raw) - self._next_event
         self._next_event = written
-        return [Event(json.loads(text)) for text in raw], lost
+        return [RunEvent(json.loads(text)) for text in raw], lost
 
     @property
     def written(self) -> int:

@@ -1,8 +1,11 @@
 """What a reader of samples must know about the machine: kept in the ring's header and in the recording."""
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
+
+from config.schema import GatewayConfig, Role
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +56,31 @@ class RunConstants:
     def to_json(self) -> str:
         """Compact JSON with sorted keys: the same constants give the same text."""
         return json.dumps(asdict(self), sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+    @classmethod
+    def from_config(cls, config: GatewayConfig, closure: int) -> "RunConstants":
+        """The machine of a configuration; ``closure`` is the assembly mode that its cam was compiled for."""
+        five_bar = config.machine.five_bar
+        roles = [axis.role for axis in config.ordered_axes]
+        return cls(
+            config_name=config.name,
+            period_s=config.cycle_s,
+            axes=tuple(
+                AxisConstants(name, axis.counts_per_revolution, axis.rated_torque_Nm, math.radians(axis.home_angle_deg))
+                for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
+            ),
+            master_axis=roles.index(Role.MASTER),
+            slave_axis=roles.index(Role.SLAVE),
+            mechanism=MechanismConstants(
+                p_m=five_bar.p_mm * 1e-3,
+                q_m=five_bar.q_mm * 1e-3,
+                r_m=five_bar.r_mm * 1e-3,
+                s_m=five_bar.s_mm * 1e-3,
+                cv_pivot_m=(five_bar.cv_pivot_mm[0] * 1e-3, five_bar.cv_pivot_mm[1] * 1e-3),
+                servo_pivot_m=(five_bar.servo_pivot_mm[0] * 1e-3, five_bar.servo_pivot_mm[1] * 1e-3),
+                closure=closure,
+            ),
+        )
 
     @classmethod
     def from_json(cls, text: str) -> "RunConstants":

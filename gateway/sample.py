@@ -106,8 +106,8 @@ class SampleLayout:
     """The record for machines with these axes.
 
     Attributes: ``axis_names``; ``format`` and ``size`` (bytes of one record, a multiple of 8) of the struct; ``dtype``,
-    the same as a numpy structured type; ``recorded_dtype``, which has two derived fields more; ``schema_text``, the
-    ROS 2 message definition of the latter; ``pack_into``.
+    the same as a numpy structured type; ``recorded_dtype``, which has two derived fields more, and ``recorded_size``,
+    the bytes of it that are recorded; ``schema_text``, the ROS 2 message definition of the latter; ``pack_into``.
 
     Raises ``ValueError`` for no axes, more than ``MAX_AXES``, or a name twice.
     """
@@ -137,6 +137,7 @@ class SampleLayout:
         self.pack: Final[Callable[..., bytes]] = packer.pack
         self.dtype: Final = _dtype(_FIELDS, count)
         self.recorded_dtype: Final = _dtype((*_FIELDS, *_DERIVED), count)
+        self.recorded_size: Final = self.recorded_dtype.itemsize - _trailing_padding(self.recorded_dtype)
         self.schema_text: Final = _schema_text(names)
 
     @property
@@ -164,6 +165,11 @@ def _dtype(fields: Sequence[_Field], count: int) -> np.dtype[Any]:
     # align=True places fields as C and CDR do, each at a multiple of its own size
     columns = [(f.name, "<" + _NUMPY_CODES[f.code], (count,) if f.per_axis else ()) for f in fields]
     return np.dtype(columns, align=True)
+
+
+def _trailing_padding(dtype: np.dtype[Any]) -> int:
+    # CDR pads before a field, never after the last one
+    return dtype.itemsize - max(field[1] + field[0].itemsize for field in dict(dtype.fields or {}).values())
 
 
 _NUMPY_CODES: Final = {"q": "i8", "d": "f8", "i": "i4", "H": "u2", "h": "i2"}
