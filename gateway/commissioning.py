@@ -1,0 +1,204 @@
+"""Brings the drives of a configuration to the state in which the cycle can run: everything checked, nothing moving.
+
+Every step is taken on all drives before the next one, and what is wrong with *all* of them is reported at once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from drivers import objects
+from drivers.errors import NodeError, SdoAbortedError
+from drivers.master import Master, Procedure
+from drivers.nmt import NmtCommand
+from drivers.object_dictionary import DataType
+from drivers.pdo import (
+    PDO_COB_ID_INVALID,
+    PDO_COB_ID_NO_RTR,
+    RPDO_BASE,
+    SYNCHRONOUS_EVERY_SYNC,
+    TPDO_BASE,
+    MappingEntry,
+)
+from gateway.errors import CommissioningError
+
+DEVICE_PROFILE_402: Final = 0x0192
+"""Low word of 1000h of every CiA 402 drive."""
+PDO_COUNT: Final = 4
+U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
+I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
+
+RPDO_ENTRIES: Final = (
+    MappingEntry(objects.CONTROLWORD, 0, 16),
+    MappingEntry(objects.TARGET_POSITION, 0, 32),
+    MappingEntry(objects.TORQUE_OFFSET, 0, 16),
+)
+TPDO_ENTRIES: Final = (
+    MappingEntry(objects.STATUSWORD, 0, 16),
+    MappingEntry(objects.POSITION_ACTUAL_VALUE, 0, 32),
+    MappingEntry(objects.TORQUE_ACTUAL_VALUE, 0, 16),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSettings:
+    """What one drive is to be, as commissioning needs it."""
+
+    name: str
+    node_id: int
+    identity: tuple[int | None, int | None, int | None, int | None]
+    """1018h:01 to :04 as they must be; None: not checked."""
+    following_error_window: int
+    """Counts, 6065h."""
+    rated_torque_mNm: int
+    counts_per_revolution: int
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkSettings:
+    """What all drives have in common."""
+
+    gateway_node_id: int
+    heartbeat_ms: int
+    heartbeat_timeout_ms: int
+    boot_up_timeout_s: float
+    cycle_us: int
+    interpolation_time: tuple[int, int]
+    """60C2h: value, power of ten in seconds."""
+
+
+IDENTITY_NAMES: Final = ("vendor id", "product code", "revision number", "serial number")
+
+Step = Callable[[NodeSettings], Procedure[None]]
+
+
+def for_all(nodes: Sequence[NodeSettings], step: Step) -> Procedure[None]:
+    """Take a step on every node; raises one CommissioningError with what went wrong on any of them."""
+    problems: list[str] = []
+    for node in nodes:
+        try:
+            yield from step(node)
+        except NodeError as error:
+            problems.append(f"axis {node.name}: {error}")
+        except CommissioningError as error:
+            problems.extend(f"axis {node.name}: {problem}" for problem in error.problems)
+    if problems:
+        raise CommissioningError(problems)
+
+
+def commission(master: Master, nodes: Sequence[NodeSettings], network: NetworkSettings) -> Procedure[None]:
+    """Boot-up, identity, parameters, PDO mapping, heartbeats. Leaves the nodes pre-operational.
+
+    Raises CommissioningError.
+    """
+    yield from for_all(nodes, lambda node: master.reset_communication(node.node_id, network.boot_up_timeout_s))
+    yield from for_all(nodes, lambda node: check_identity(master, node))
+    yield from for_all(nodes, lambda node: write_parameters(master, node, network))
+    yield from for_all(nodes, lambda node: map_pdos(master, node))
+    yield from for_all(nodes, lambda node: set_up_heartbeats(master, node, network))
+
+
+def check_identity(master: Master, node: NodeSettings) -> Procedure[None]:
+    """Refuse a node that is no CiA 402 drive, or another one than the configuration names."""
+    problems: list[str] = []
+    device_type = yield from master.read_int(node.node_id, objects.DEVICE_TYPE, 0, U32)
+    if device_type & 0xFFFF != DEVICE_PROFILE_402:
+        problems.append(
+            f"node {node.node_id} has device type {device_type:08X}h, which is no CiA 402 drive (low word 0192h)"
+        )
+    for subindex, (name, expected) in enumerate(zip(IDENTITY_NAMES, node.identity, strict=True), start=1):
+        if expected is None:
+            continue
+        found = yield from master.read_int(node.node_id, objects.IDENTITY, subindex, U32)
+        if found != expected:
+            problems.append(f"node {node.node_id} has {name} {found:08X}h, the configuration says {expected:08X}h")
+    if problems:
+        raise CommissioningError(problems)
+
+
+def write_parameters(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
+    """Write what the cycle relies on, and check the scales that the drive itself has."""
+    node_id = node.node_id
+    value, exponent = network.interpolation_time
+    yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 1, U8, value)
+    yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 2, I8, exponent)
+    yield from master.write(node_id, objects.COMMUNICATION_CYCLE_PERIOD, 0, U32, network.cycle_us)
+    yield from master.write(node_id, objects.FOLLOWING_ERROR_WINDOW, 0, U32, node.following_error_window)
+    rated = yield from master.read_int(node_id, objects.MOTOR_RATED_TORQUE, 0, U32)
+    increments = yield from master.read_int(node_id, objects.POSITION_ENCODER_RESOLUTION, 1, U32)
+    revolutions = yield from master.read_int(node_id, objects.POSITION_ENCODER_RESOLUTION, 2, U32)
+    problems: list[str] = []
+    if rated != node.rated_torque_mNm:
+        problems.append(
+            f"node {node_id} has a rated torque of {rated} mN m (6076h), the configuration says {node.rated_torque_mNm}"
+        )
+    if revolutions == 0 or increments != node.counts_per_revolution * revolutions:
+        problems.append(
+            f"node {node_id} has {increments} increments in {revolutions} revolutions (608Fh), "
+            f"the configuration says {node.counts_per_revolution} a revolution"
+        )
+    if problems:
+        raise CommissioningError(problems)
+
+
+def map_pdos(master: Master, node: NodeSettings) -> Procedure[None]:
+    """Map the first RPDO and TPDO as the cycle needs them, synchronous, and switch all others off."""
+    node_id = node.node_id
+    for number in range(1, PDO_COUNT):
+        yield from _disable_pdo(master, node_id, objects.RPDO_COMMUNICATION + number)
+        yield from _disable_pdo(master, node_id, objects.TPDO_COMMUNICATION + number)
+    yield from map_pdo(
+        master,
+        node_id,
+        objects.RPDO_COMMUNICATION,
+        objects.RPDO_MAPPING,
+        RPDO_BASE[0] + node_id,
+        RPDO_ENTRIES,
+    )
+    yield from map_pdo(
+        master,
+        node_id,
+        objects.TPDO_COMMUNICATION,
+        objects.TPDO_MAPPING,
+        (TPDO_BASE[0] + node_id) | PDO_COB_ID_NO_RTR,
+        TPDO_ENTRIES,
+    )
+
+
+def _disable_pdo(master: Master, node_id: int, communication: int) -> Procedure[None]:
+    """Set bit 31 and keep the rest, as some drives demand; a PDO that the drive does not have is no fault."""
+    try:
+        cob_id = yield from master.read_int(node_id, communication, 1, U32)
+    except SdoAbortedError:
+        return
+    if not cob_id & PDO_COB_ID_INVALID:
+        yield from master.write(node_id, communication, 1, U32, cob_id | PDO_COB_ID_INVALID)
+
+
+def map_pdo(
+    master: Master, node_id: int, communication: int, mapping: int, cob_id: int, entries: Sequence[MappingEntry]
+) -> Procedure[None]:
+    """Map one PDO in the order that CiA 301 prescribes: invalid, no entries, entries, their number, valid."""
+    current = yield from master.read_int(node_id, communication, 1, U32)
+    yield from master.write(node_id, communication, 1, U32, current | PDO_COB_ID_INVALID)
+    yield from master.write(node_id, communication, 2, U8, SYNCHRONOUS_EVERY_SYNC)
+    yield from master.write(node_id, mapping, 0, U8, 0)
+    for number, entry in enumerate(entries, start=1):
+        yield from master.write(node_id, mapping, number, U32, entry.word)
+    yield from master.write(node_id, mapping, 0, U8, len(entries))
+    yield from master.write(node_id, communication, 1, U32, cob_id)
+
+
+def set_up_heartbeats(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
+    """The drive's heartbeat, its watch over the gateway's, and our watch over the drive's."""
+    node_id = node.node_id
+    consumer = network.gateway_node_id << 16 | network.heartbeat_timeout_ms
+    yield from master.write(node_id, objects.CONSUMER_HEARTBEAT_TIME, 1, U32, consumer)
+    yield from master.write(node_id, objects.PRODUCER_HEARTBEAT_TIME, 0, U16, network.heartbeat_ms)
+    master.watch_heartbeat(node_id, network.heartbeat_timeout_ms / 1000.0)
+
+
+def start_nodes(master: Master, nodes: Sequence[NodeSettings]) -> None:
+    """NMT start, node by node: nodes that are not ours stay as they are."""
+    for node in nodes:
+        master.command(NmtCommand.START, node.node_id)

@@ -1,0 +1,324 @@
+"""The cycle: SYNC, actual values, guard, demand, RPDOs, in one fixed order; a core without I/O.
+
+    SYNC(k) -> drives latch actual values, apply the demand received before SYNC(k), send TPDOs(k)
+            -> the loop has all TPDOs(k), or their deadline passes -> guard -> demand -> RPDOs -> SYNC(k+1)
+
+A drive in cyclic synchronous position reaches the target that it applied at SYNC(k-1) at SYNC(k), where it also latches
+its actual position. So the following error of cycle k compares the target that was *sent* in cycle k-2 with the actual
+value latched at SYNC(k): both belong to the same instant.
+"""
+
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from config.schema import Reaction
+from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
+from drivers.frame import Frame
+from drivers.nmt import SYNC_COB_ID
+from drivers.object_dictionary import DataType
+from drivers.pdo import RPDO_BASE, TPDO_BASE, PdoLayout
+from gateway.demand import Demand
+from gateway.guard import Condition, Guard, StopReason
+from gateway.sample import Phase, SampleFlag, saturate_int32
+from gateway.units import AxisUnits
+
+RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
+"""Controlword, target position, torque offset."""
+TPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
+"""Statusword, position actual value, torque actual value."""
+
+SYNC_FRAME: Final = Frame(SYNC_COB_ID)
+TPDO_DEADLINE: Final = 0.8
+"""Share of the cycle after which a TPDO counts as missed and the demand is sent without it."""
+STATUSWORD_STATE_MASK: Final = 0x6F
+STATUSWORD_OPERATION_ENABLED: Final = 0x27
+
+
+class SampleSink(Protocol):
+    """Where the cycle's samples go: the shared-memory ring, or a list in virtual time."""
+
+    def append(self, *values: float) -> None:
+        """Take one sample, the values in the order of ``SampleLayout.pack_into``."""
+        ...
+
+
+class AxisChannel:
+    """One axis as the cycle sees it: what it sends to the drive and what came back last."""
+
+    __slots__ = (
+        "actual",
+        "controlword",
+        "following_error_limit",
+        "name",
+        "node_id",
+        "rpdo_cob_id",
+        "statusword",
+        "target",
+        "torque",
+        "torque_offset",
+        "tpdo_cob_id",
+        "units",
+    )
+
+    def __init__(self, name: str, node_id: int, units: AxisUnits, following_error_limit: int) -> None:
+        self.name = name
+        self.node_id = node_id
+        self.units = units
+        self.following_error_limit = following_error_limit
+        self.rpdo_cob_id = RPDO_BASE[0] + node_id
+        self.tpdo_cob_id = TPDO_BASE[0] + node_id
+        self.controlword = COMMAND_DISABLE_VOLTAGE
+        self.target = 0
+        self.torque_offset = 0
+        self.statusword = 0
+        self.actual = 0
+        self.torque = 0
+
+
+class CyclicLoop:
+    """The cyclic exchange with all axes.
+
+    Until ``follow`` is called the target of a drive without torque is its actual position, and it is held from the
+    moment the drive is enabled, so that the axis stays where it is. The host calls ``sent`` after it has handed a batch
+    of frames to the bus.
+    """
+
+    def __init__(
+        self,
+        axes: list[AxisChannel],
+        period_ns: int,
+        guard: Guard,
+        sink: SampleSink,
+        cpu_clock: Callable[[], int] | None = None,
+    ) -> None:
+        """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0."""
+        self.axes = axes
+        self.period_ns = period_ns
+        self.guard = guard
+        self.outbox: list[Frame] = []
+        self.cycle = -1
+        self.is_running = False
+        self.actuals_are_valid = False
+        """Every axis has sent a TPDO for the cycle that was closed last."""
+        self.phase = Phase.COMMISSIONING
+        self.is_guarding_enabled = False
+        """Set while all drives are meant to be in Operation enabled."""
+        self.tpdo_slots = {axis.tpdo_cob_id: number for number, axis in enumerate(axes)}
+        self._sink = sink
+        self._cpu_clock = cpu_clock
+        self._cpu_ns = 0
+        self._cpu_last_ns = 0
+        self._demand: Demand | None = None
+        self._all_axes = (1 << len(axes)) - 1
+        self._deadline_share_ns = round(period_ns * (1.0 - TPDO_DEADLINE))
+        self._sync_due_ns = 0
+        self._sync_ns = 0
+        self._sync_deviation_ns = 0
+        self._sync_period_ns = 0
+        self._awaited = 0
+        self._is_closed = True
+        self._arrival_ns = 0
+        self._sent_ns = 0
+        self._flags = 0
+        nothing = (0.0, 0.0, [0.0] * len(axes), [0] * len(axes), [0] * len(axes), int(Phase.COMMISSIONING))
+        self._in_force = self._applied = self._sent = nothing
+        """Demands by age: reached at the last SYNC, applied at the last SYNC, sent last. Each is (master position,
+        master velocity, velocities, targets, torque offsets, phase)."""
+
+    # -- commands ------------------------------------------------------------------------------------------------
+
+    def start(self, now_ns: int) -> None:
+        """Begin the cycle: the first SYNC goes out one period from now."""
+        self.is_running = True
+        self._sync_due_ns = now_ns + self.period_ns
+        self._sync_ns = now_ns
+        self._is_closed = True
+
+    def stop(self) -> None:
+        """No further SYNC."""
+        self.is_running = False
+
+    def follow(self, demand: Demand | None) -> None:
+        """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions."""
+        self._demand = demand
+
+    def command(self, controlword: int) -> None:
+        """Send this controlword to every axis from the next RPDO on."""
+        for axis in self.axes:
+            axis.controlword = controlword
+
+    def controlled_stop(self) -> None:
+        """Ramp the master down on the cam, if anything is in motion."""
+        if self._demand is not None:
+            self._demand.controlled_stop()
+
+    def quick_stop(self) -> None:
+        """Quick stop on every drive; the demand is left behind."""
+        self.is_guarding_enabled = False
+        self.command(COMMAND_QUICK_STOP)
+        self._demand = None
+        self.phase = Phase.QUICK_STOP
+
+    # -- the cycle -----------------------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int:
+        """The TPDOs' deadline while they are awaited, else the next SYNC."""
+        return self._sync_due_ns if self._is_closed else self._sync_due_ns - self._deadline_share_ns
+
+    def wake(self, now_ns: int) -> bool:
+        """Do what is due; returns whether a cycle was closed."""
+        closed = False
+        if not self._is_closed and now_ns >= self._sync_due_ns - self._deadline_share_ns:
+            self._close(now_ns)
+            closed = True
+        if now_ns >= self._sync_due_ns:
+            self._send_sync(now_ns)
+        return closed
+
+    def receive_tpdo(self, number: int, data: bytes, now_ns: int) -> bool:
+        """Take the TPDO of axis ``number``; returns whether it closed the cycle."""
+        if len(data) != TPDO_LAYOUT.length:
+            return False
+        axis = self.axes[number]
+        axis.statusword, axis.actual, axis.torque = TPDO_LAYOUT.unpack_from(data)
+        self._awaited &= ~(1 << number)
+        if self._awaited or self._is_closed:
+            return False
+        self._arrival_ns = now_ns
+        self._close(now_ns)
+        return True
+
+    def sent(self, now_ns: int) -> None:
+        """The host has handed all frames to the bus at this time."""
+        if self._is_closed:
+            self._sent_ns = now_ns
+
+    def _send_sync(self, now_ns: int) -> None:
+        lateness_ns = now_ns - self._sync_due_ns
+        if self.cycle >= 0:
+            self._account()
+        self.outbox.append(SYNC_FRAME)
+        self._flags = 0
+        if lateness_ns >= self.period_ns:
+            # Lost cycles are not made up for: two SYNCs at once would be worse for the drives than a gap.
+            self._flags = int(SampleFlag.OVERRUN)
+            self._sync_due_ns += lateness_ns // self.period_ns * self.period_ns
+        self._sync_due_ns += self.period_ns
+        self._sync_deviation_ns = lateness_ns
+        self._sync_period_ns = now_ns - self._sync_ns
+        self._sync_ns = now_ns
+        self._arrival_ns = now_ns
+        self._sent_ns = 0
+        self.cycle += 1
+        self._awaited = self._all_axes
+        self._is_closed = False
+
+    def _close(self, now_ns: int) -> None:
+        """All TPDOs of this cycle are here, or overdue: guard, demand, RPDOs."""
+        self._is_closed = True
+        self._sent_ns = now_ns
+        self._flags |= self._awaited
+        self.actuals_are_valid = not self._awaited
+        self._in_force = self._applied
+        self._applied = self._sent
+        if self.phase is not Phase.COMMISSIONING:
+            self._check(now_ns)
+        demand = self._demand
+        axes = self.axes
+        outbox = self.outbox
+        if demand is None:
+            for axis in axes:
+                # A drive that holds torque keeps its target: one that follows the actual position has no stiffness.
+                if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
+                    axis.target = axis.actual
+                axis.torque_offset = 0
+            targets = [axis.target for axis in axes]
+            zeros = [0] * len(axes)
+            self._sent = (self._sent[0], 0.0, [0.0] * len(axes), targets, zeros, int(self.phase))
+        else:
+            demand.step()
+            for axis, target, torque in zip(axes, demand.targets, demand.torque_offsets, strict=True):
+                axis.target = target
+                axis.torque_offset = torque
+            self.phase = demand.phase
+            self._sent = (
+                demand.master_position,
+                demand.master_velocity,
+                demand.velocities.copy(),
+                demand.targets.copy(),
+                demand.torque_offsets.copy(),
+                int(demand.phase),
+            )
+        for axis in axes:
+            payload = RPDO_LAYOUT.pack(axis.controlword, axis.target, axis.torque_offset)
+            outbox.append(Frame(axis.rpdo_cob_id, payload))
+
+    def _check(self, now_ns: int) -> None:
+        guard = self.guard
+        targets = self._in_force[3]
+        is_guarding = self.is_guarding_enabled
+        for number, axis in enumerate(self.axes):
+            if self._awaited >> number & 1:
+                guard.hold(Condition.MISSED_TPDO, number, self.cycle, 0, now_ns)
+                continue
+            guard.clear(Condition.MISSED_TPDO, number)
+            if not is_guarding:
+                continue
+            if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
+                guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, STATUSWORD_OPERATION_ENABLED, now_ns)
+            else:
+                guard.clear(Condition.DRIVE_FAULT, number)
+            error = targets[number] - axis.actual
+            if -axis.following_error_limit <= error <= axis.following_error_limit:
+                guard.clear(Condition.FOLLOWING_ERROR, number)
+            else:
+                guard.hold(Condition.FOLLOWING_ERROR, number, error, axis.following_error_limit, now_ns)
+        if guard.tripped:
+            self.react()
+
+    def react(self) -> None:
+        """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
+        if self.guard.reaction is Reaction.QUICK_STOP and self.phase is not Phase.QUICK_STOP:
+            self.quick_stop()
+        elif self.guard.reaction is Reaction.CONTROLLED_STOP:
+            self.controlled_stop()
+
+    def _account(self) -> None:
+        """Hand on the sample of the cycle that ends with the SYNC about to be sent."""
+        if self._cpu_clock is not None:
+            cpu_ns = self._cpu_clock()
+            self._cpu_ns = cpu_ns - self._cpu_last_ns if self._cpu_last_ns else 0
+            self._cpu_last_ns = cpu_ns
+        # An overrun moves the grid on; the demand's deadline is the SYNC that was due next.
+        lead_ns = self._sync_due_ns - self._sent_ns
+        if lead_ns < 0:
+            self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
+            self.guard.hold(Condition.MISSED_DEADLINE, 0, lead_ns, 0, self._sync_ns)
+        else:
+            self.guard.clear(Condition.MISSED_DEADLINE, 0)
+        master_position, master_velocity, velocities, targets, torque_offsets, phase = self._in_force
+        axes = self.axes
+        self._sink.append(
+            self.cycle,
+            self._sync_ns,
+            master_position,
+            master_velocity,
+            *velocities,
+            saturate_int32(self._sync_deviation_ns),
+            saturate_int32(self._sync_period_ns),
+            saturate_int32(self._sync_deviation_ns),
+            saturate_int32(self._arrival_ns - self._sync_ns),
+            saturate_int32(lead_ns),
+            saturate_int32(self._cpu_ns),
+            phase,
+            self._flags,
+            *targets,
+            *[axis.actual for axis in axes],
+            *[axis.statusword for axis in axes],
+            *[axis.torque for axis in axes],
+            *torque_offsets,
+        )
+
+
+STOP_REASONS_WITHOUT_FAULT: Final = frozenset({StopReason.COMPLETED, StopReason.OPERATOR})
+"""Ends of a run that are not the machine saying no."""

@@ -1,0 +1,112 @@
+"""Where the demand comes from: the master's plan, the cam, and their conversion into counts, one step a cycle."""
+
+from typing import Final, Protocol
+
+from gateway.sample import Phase
+from gateway.units import AxisUnits
+from mechanism.cam_profile import CamProfile
+from mechanism.motion import MasterPhase, MasterPlan, plan_stop
+
+MASTER: Final = 0
+SLAVE: Final = 1
+
+PHASE_OF_PLAN: Final = {
+    MasterPhase.RAMP_UP: Phase.RAMP_UP,
+    MasterPhase.CRUISE: Phase.CAM,
+    MasterPhase.RAMP_DOWN: Phase.RAMP_DOWN,
+    MasterPhase.FINISHED: Phase.STANDSTILL,
+}
+
+
+class Demand(Protocol):
+    """What the cycle asks for its targets; all attributes are those of the last step taken."""
+
+    targets: list[int]
+    """Counts, one an axis."""
+    torque_offsets: list[int]
+    """Per mille of rated torque, one an axis."""
+    velocities: list[float]
+    """rad/s of each link."""
+    master_position: float
+    """theta2, unwrapped, rad."""
+    master_velocity: float
+    """rad/s."""
+    phase: Phase
+
+    def step(self) -> None:
+        """Take the next step of one cycle; at the plan's end stay where it ended, in phase STANDSTILL."""
+        ...
+
+    def controlled_stop(self) -> None:
+        """Ramp the master down from where it is; the slaves stay on the cam."""
+        ...
+
+
+class CamDemand:
+    """Two axes of a five-bar: the master follows its plan in theta2, the slave the cam theta5(theta2)."""
+
+    def __init__(
+        self,
+        cam: CamProfile,
+        units: tuple[AxisUnits, AxisUnits],
+        period_s: float,
+        acceleration_limit: float,
+        jerk_limit: float,
+    ) -> None:
+        """``acceleration_limit`` (rad/s^2) and ``jerk_limit`` (rad/s^3) bound the master's controlled stop."""
+        self._cam = cam
+        self._units = units
+        self._period_s = period_s
+        self._limits = (acceleration_limit, jerk_limit)
+        self._plan: MasterPlan | None = None
+        self._step = 0
+        self._acceleration = 0.0
+        self._is_stopping = False
+        self.targets = [0, 0]
+        self.torque_offsets = [0, 0]
+        self.velocities = [0.0, 0.0]
+        self.master_position = 0.0
+        self.master_velocity = 0.0
+        self.phase = Phase.STANDSTILL
+
+    def begin(self, plan: MasterPlan) -> None:
+        """Follow ``plan`` from its start with the next step."""
+        self._plan = plan
+        self._step = 0
+        self._is_stopping = False
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the plan has been followed to its end."""
+        return self._plan is not None and self._step * self._period_s >= self._plan.duration_s
+
+    def start_targets(self, master_position: float) -> tuple[int, int]:
+        """Counts of both axes with the master at this theta2: where they must stand before a plan begins there."""
+        theta5 = self._cam.at(master_position)[0]
+        return self._units[MASTER].counts(master_position), self._units[SLAVE].counts(theta5)
+
+    def step(self) -> None:
+        """Take the next step; see ``Demand``."""
+        plan = self._plan
+        if plan is None:
+            return
+        self._step += 1
+        at_s = self._step * self._period_s
+        position, velocity, self._acceleration = plan.at(at_s)
+        theta5, slope, _, _ = self._cam.at(position)
+        self.master_position = position
+        self.master_velocity = velocity
+        self.velocities[MASTER] = velocity
+        self.velocities[SLAVE] = slope * velocity
+        self.targets[MASTER] = self._units[MASTER].counts(position)
+        self.targets[SLAVE] = self._units[SLAVE].counts(theta5)
+        phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
+        self.phase = Phase.CONTROLLED_STOP if self._is_stopping and phase is not Phase.STANDSTILL else phase
+
+    def controlled_stop(self) -> None:
+        """Ramp the master down from where it is; see ``Demand``."""
+        if self._is_stopping or self._plan is None:
+            return
+        plan = plan_stop(self.master_position, self.master_velocity, self._acceleration, *self._limits)
+        self.begin(plan)
+        self._is_stopping = True

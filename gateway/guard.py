@@ -1,0 +1,93 @@
+"""What the cycle watches, and what it does about it: one table of conditions, each with one reaction."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from config.schema import ConditionSection, GuardSection, Reaction
+from drivers.node import Event
+
+
+class Condition(Enum):
+    """Guarded conditions; the values are the keys of the configuration's guard section."""
+
+    FOLLOWING_ERROR = "following_error"
+    MISSED_TPDO = "missed_tpdo"
+    MISSED_DEADLINE = "missed_deadline"
+    EMERGENCY = "emergency"
+    DRIVE_FAULT = "drive_fault"
+    HEARTBEAT_LOST = "heartbeat_lost"
+
+
+class StopReason(Enum):
+    """Why a run ended; ``stopped_by`` of the report."""
+
+    COMPLETED = "completed"
+    OPERATOR = "operator"
+    FOLLOWING_ERROR = "following_error"
+    MISSED_TPDO = "missed_tpdo"
+    MISSED_DEADLINE = "missed_deadline"
+    EMERGENCY = "emergency"
+    DRIVE_FAULT = "drive_fault"
+    HEARTBEAT_LOST = "heartbeat_lost"
+    COMMISSIONING = "commissioning"
+    BUS_LOST = "bus_lost"
+
+
+STRENGTH = {Reaction.WARN: 0, Reaction.CONTROLLED_STOP: 1, Reaction.QUICK_STOP: 2}
+"""A stronger reaction replaces a weaker one, never the other way round."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardTripped(Event):
+    """A guarded condition has held for its persistence.
+
+    ``axis`` is the axis' name, empty where the condition is not one axis'; ``value`` and ``limit`` are in the
+    condition's own unit (counts, cycles, an error code).
+    """
+
+    condition: Condition
+    axis: str
+    value: int
+    limit: int
+    reaction: Reaction
+
+
+class Guard:
+    """Counts how long conditions hold; one counter for each condition and axis."""
+
+    def __init__(self, section: GuardSection, axis_names: tuple[str, ...]) -> None:
+        rules: Mapping[Condition, ConditionSection] = {
+            condition: getattr(section, condition.value) for condition in Condition
+        }
+        self._persistence = {condition: rule.persistence_cycles for condition, rule in rules.items()}
+        self._reaction = {condition: rule.reaction for condition, rule in rules.items()}
+        self._axis_names = axis_names
+        self._counts = {condition: [0] * len(axis_names) for condition in Condition}
+        self.reaction: Reaction | None = None
+        """The strongest reaction that has been called for so far, warnings apart."""
+        self.stopped_by: StopReason | None = None
+        """The first condition that called for more than a warning."""
+        self.tripped: list[GuardTripped] = []
+        """Every trip, once each; the caller takes them away."""
+
+    def clear(self, condition: Condition, axis: int) -> None:
+        """The condition does not hold in this cycle."""
+        self._counts[condition][axis] = 0
+
+    def hold(self, condition: Condition, axis: int, value: int, limit: int, now_ns: int) -> None:
+        """The condition holds in this cycle; ``axis`` 0 is used where it is not one axis'."""
+        counts = self._counts[condition]
+        counts[axis] += 1
+        if counts[axis] != self._persistence[condition]:
+            return
+        reaction = self._reaction[condition]
+        is_of_one_axis = condition is not Condition.MISSED_DEADLINE
+        name = self._axis_names[axis] if is_of_one_axis else ""
+        self.tripped.append(GuardTripped(now_ns, condition, name, value, limit, reaction))
+        if reaction is Reaction.WARN:
+            return
+        if self.stopped_by is None:
+            self.stopped_by = StopReason(condition.value)
+        if self.reaction is None or STRENGTH[reaction] > STRENGTH[self.reaction]:
+            self.reaction = reaction
