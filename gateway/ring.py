@@ -191,8 +191,10 @@ class RingWriter:
         self.constants: Final = mapping.constants
         self.layout: Final = mapping.layout
         words = mapping.words
-        words[_PID_START] = _start_time(os.getpid())
+        # 0 while the two words change hands: a reader then goes by the pid alone.
+        words[_PID_START] = 0
         words[_PID] = os.getpid()
+        words[_PID_START] = _start_time(os.getpid())
         self._words = words
         self._view = mapping.view
         self._pack_into: Callable[..., None] = mapping.layout.pack_into
@@ -492,12 +494,14 @@ def _start_time(pid: int) -> int:
 
 
 def _is_alive(pid: int, start_time: int) -> bool:
-    if Path("/proc/self/stat").exists():
-        return pid > 0 and start_time != 0 and _start_time(pid) == start_time
+    if pid <= 0:
+        return False
+    if start_time:
+        return _start_time(pid) == start_time
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
         return True
-    return pid > 0
+    return True
