@@ -52,8 +52,7 @@ class ClosureTrack:
         if self.immobile:
             first = self.immobile[0]
             reach = five_bar.servo_reach(float(self.actual[first, 0]), float(self.actual[first, 1]))
-            apart = "too far" if reach > 0.0 else "too near"
-            what = f"links r and s are {apart} from their joint"
+            what = f"links r and s cannot {'stretch far' if reach > 0.0 else 'fold close'} enough"
             raise UnreachableError(first, float(self.theta2[first]), abs(reach), 0.0, what)
 
 

@@ -36,7 +36,7 @@ class UnreachableError(MechanismError):
         where = f"theta2 = {degrees(theta2_rad):.2f} deg"
         if point_index is not None:
             where = f"point {point_index} ({where})"
-        super().__init__(f"{where} is out of reach: {what} by {distance_m * 1e3:.3f} mm (bound {bound_m * 1e3:.3f} mm)")
+        super().__init__(f"{where} is out of reach by {distance_m * 1e3:.3f} mm (bound {bound_m * 1e3:.3f} mm): {what}")
         self.point_index = point_index
         self.theta2_rad = theta2_rad
         self.distance_m = distance_m
