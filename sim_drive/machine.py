@@ -1,0 +1,403 @@
+"""The emulated machine: every drive of it and the plant they move, as one node on the bus.
+
+It owns the servo rate. Servo tick n is due exactly n * 1953125 // 2 ns after the start (1024 Hz), in integers, so that
+the ticks never drift against the bus, and stand at the same nanoseconds in every run.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import floor, isfinite, pi
+from random import Random
+from typing import Final, NamedTuple, Protocol
+
+from drivers.frame import Frame
+from drivers.node import Event
+from sim_drive.plant import SERVO_PERIOD_S, Plant
+from sim_drive.servo import SERVO_RATE_HZ, DemandResolution, ServoLoop
+
+TWO_SERVO_PERIODS_NS: Final = 2_000_000_000 // SERVO_RATE_HZ
+"""A servo period is not a whole number of nanoseconds, but two are: 1953125 ns."""
+MAX_CATCH_UP_NS: Final = 1_000_000_000
+"""A host that comes later than this has lost the time in between: see `TimeSkipped`."""
+LINKAGE_TORN_ERROR_CODE: Final = 0xFF10
+"""EMCY error code of a drive whose linkage has torn: of the device-specific range FF00h to FFFFh (CiA 301, 7.2.7.1)."""
+LINKAGE_TORN_REGISTER_BITS: Final = 0x81
+"""Generic and manufacturer-specific error (CiA 301, object error register)."""
+
+_NEVER: Final = 1 << 63
+_MAX_WAKES_PER_INSTANT: Final = 16
+_MAX_CROSS_ROUNDS: Final = 8
+
+
+Latch = Callable[[int], tuple[int, float, int]]
+"""Actual values at an instant (ns): position in counts, velocity in counts/s, torque in per mille of rated torque."""
+
+
+class MachineDrive(Protocol):
+    """What the machine needs of a drive; `sim_drive.drive` has the real one."""
+
+    outbox: list[Frame]
+    """Frames to send, oldest first; the machine empties it in place."""
+    events: list[Event]
+    """Events, oldest first; the machine empties it in place."""
+    subscriptions_changed: bool
+    """Set by the drive when `cob_ids` has changed, reset by the machine."""
+    latch: Latch
+    """Set by the machine: what the drive's resolver and amplifier show at an instant."""
+
+    @property
+    def position_demand_counts(self) -> float: ...
+    @property
+    def torque_offset_Nm(self) -> float: ...  # noqa: N802
+    @property
+    def is_powered(self) -> bool: ...
+    @property
+    def brake_released(self) -> bool: ...
+    @property
+    def gains(self) -> Sequence[int]: ...
+    def cob_ids(self) -> set[int]: ...
+    def receive(self, frame: Frame, now_ns: int) -> None: ...
+    def next_wake_ns(self) -> int | None: ...
+    def wake(self, now_ns: int) -> None: ...
+    def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None: ...
+    def trip(self, error_code: int, error_register_bits: int, now_ns: int) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class MachineAxis:
+    """Resolver and scaling of one axis.
+
+    ``torque_per_volt`` in N m / V is the amplifier's; ``rated_torque_Nm`` is what 1000 per mille are;
+    ``resolver_noise_counts`` the standard deviation of the resolver's noise before it is quantised, 0 for none.
+
+    Raises ValueError where a value is out of its bounds.
+    """
+
+    counts_per_revolution: int = 4096
+    torque_per_volt: float = 0.45
+    rated_torque_Nm: float = 1.0
+    resolver_noise_counts: float = 0.0
+    demand_resolution: DemandResolution = DemandResolution.UNROUNDED_DIFFERENCE
+
+    def __post_init__(self) -> None:
+        if self.counts_per_revolution < 1:
+            raise ValueError(f"counts_per_revolution = {self.counts_per_revolution!r}, must be 1 or more")
+        for name, value in (("torque_per_volt", self.torque_per_volt), ("rated_torque_Nm", self.rated_torque_Nm)):
+            if not (isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} = {value!r}, must be finite and positive")
+        if not (isfinite(self.resolver_noise_counts) and self.resolver_noise_counts >= 0.0):
+            raise ValueError(f"resolver_noise_counts = {self.resolver_noise_counts!r}, must be finite and zero or more")
+
+
+@dataclass(frozen=True, slots=True)
+class LinkageTorn(Event):
+    """The linkage has come too near a singular position and is torn; every drive of the machine has been tripped."""
+
+    plant_time_s: float
+    angles_rad: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSkipped(Event):
+    """The host came so late that servo ticks have been left out; the plant stood still meanwhile."""
+
+    skipped_ticks: int
+
+
+class TickRecord(NamedTuple):
+    """One servo tick for diagnosis; every tuple has one value an axis."""
+
+    at_ns: int
+    angles_rad: tuple[float, ...]
+    counts: tuple[int, ...]
+    demands_counts: tuple[float, ...]
+    torque_commands_Nm: tuple[float, ...]
+    torques_Nm: tuple[float, ...]
+
+
+class EmulatedMachine:
+    """Drives and plant as one core (`drivers.node.Node`); drive i moves axis i of the plant.
+
+    At a servo tick the plant is first advanced to it under the torques commanded at the tick before. Then each drive
+    in turn is shown its resolver and asked for its demand, from which its servo loop makes the torque for the coming
+    period. A drive that is not powered gets no torque, and its servo loop starts anew, without a jump, when it is.
+
+    Frames are dispatched by COB-ID. What one drive sends, the other drives of the machine hear too, as on a wire, but
+    at once rather than after its time on the wire: after all drives have taken the frame or tick that caused it, so
+    that a TPDO sent at a SYNC reaches the others after their own SYNC, as it would on a wire.
+
+    A late ``wake`` runs all that is due, in the order of its own instants, each with its own exact time; more than
+    `MAX_CATCH_UP_NS` late, the servo ticks in between are left out and `TimeSkipped` says so. At one instant the servo
+    tick comes first, then the drives' own wakes in their order. The same ``seed`` gives the same resolver noise.
+    """
+
+    __slots__ = (
+        "_brakes",
+        "_counts",
+        "_counts_per_rad",
+        "_events",
+        "_frames",
+        "_has_tripped",
+        "_is_powered",
+        "_next_tick_ns",
+        "_noise_source",
+        "_noises",
+        "_permille_per_Nm",
+        "_routes",
+        "_servos",
+        "_start_ns",
+        "_tick",
+        "_tick_ns",
+        "_torques",
+        "_velocities",
+        "_wakes",
+        "axes",
+        "drives",
+        "plant",
+        "records",
+    )
+
+    def __init__(
+        self,
+        drives: Sequence[MachineDrive],
+        plant: Plant,
+        axes: Sequence[MachineAxis],
+        start_ns: int = 0,
+        seed: int = 0,
+        record_ticks: int = 0,
+    ) -> None:
+        """Take over the drives and the plant at ``start_ns``.
+
+        ``record_ticks``: how many of the last servo ticks `records` keeps; 0 keeps none and costs nothing.
+
+        Raises ValueError where the numbers of drives, axes and the plant's axes differ.
+        """
+        if not len(drives) == len(axes) == plant.axis_count:
+            raise ValueError(f"{len(drives)} drives and {len(axes)} axes for a plant of {plant.axis_count} axes")
+        self.drives: Final = tuple(drives)
+        self.plant: Final = plant
+        self.axes: Final = tuple(axes)
+        self.records: Final = deque[TickRecord](maxlen=record_ticks)
+        count = len(self.drives)
+        self._counts_per_rad = [axis.counts_per_revolution / (2.0 * pi) for axis in self.axes]
+        self._permille_per_Nm = [1000.0 / axis.rated_torque_Nm for axis in self.axes]
+        self._servos = tuple(ServoLoop(axis.demand_resolution) for axis in self.axes)
+        self._noise_source = Random(seed)  # noqa: S311 - reproducible on purpose
+        self._noises = [0.0] * count
+        self._counts = [self._quantise(axis, plant.angle(axis)) for axis in range(count)]
+        self._velocities = [0.0] * count
+        self._torques = [0.0] * count
+        self._brakes = [True] * count
+        self._is_powered = [False] * count
+        self._has_tripped = False
+        self._start_ns = start_ns
+        self._tick = 0
+        self._tick_ns = start_ns
+        self._next_tick_ns = start_ns + TWO_SERVO_PERIODS_NS // 2
+        self._frames: list[Frame] = []
+        self._events: list[Event] = []
+        self._routes: dict[int, tuple[int, ...]] = {}
+        self._wakes = [_NEVER] * count
+        for index, drive in enumerate(self.drives):
+            drive.latch = self._latch_of(index)
+            self._ask_wake(index)
+        self._read_subscriptions()
+
+    @property
+    def servo_ticks(self) -> int:
+        """Number of the last servo tick, counted from 1 at one servo period after the start."""
+        return self._tick
+
+    def servo_loop(self, axis: int) -> ServoLoop:
+        """The servo loop of an axis, for diagnosis."""
+        return self._servos[axis]
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """Hand a frame of the bus to the drives that listen to it."""
+        if self._next_wake_ns() < now_ns:
+            self.wake(now_ns)
+        indices = self._routes.get(frame.cob_id)
+        if indices is None:
+            return
+        for index in indices:
+            self.drives[index].receive(frame, now_ns)
+            self._ask_wake(index)
+        self._exchange(now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """The next servo tick or the next wake of a drive; never None, for the servo ticks never end."""
+        return self._next_wake_ns()
+
+    def wake(self, now_ns: int) -> None:
+        """Run every servo tick and every drive's wake that is due, each at its own instant."""
+        if now_ns - self._next_tick_ns > MAX_CATCH_UP_NS:
+            self._skip_to(now_ns)
+        while True:
+            due_ns = self._next_tick_ns
+            earliest_ns = min(self._wakes)
+            if due_ns <= earliest_ns:
+                if due_ns > now_ns:
+                    return
+                self._run_tick(due_ns)
+            else:
+                if earliest_ns > now_ns:
+                    return
+                self._wake_drive(self._wakes.index(earliest_ns), earliest_ns)
+
+    def take_frames(self) -> list[Frame]:
+        """Frames of all drives in the order they were sent."""
+        frames = self._frames
+        if frames:
+            self._frames = []
+        return frames
+
+    def take_events(self) -> list[Event]:
+        """Events of all drives and of the machine."""
+        events = self._events
+        if events:
+            self._events = []
+        return events
+
+    def _next_wake_ns(self) -> int:
+        earliest_ns = min(self._wakes)
+        return earliest_ns if earliest_ns < self._next_tick_ns else self._next_tick_ns
+
+    def _ask_wake(self, index: int) -> None:
+        wake_ns = self.drives[index].next_wake_ns()
+        self._wakes[index] = _NEVER if wake_ns is None else wake_ns
+
+    def _wake_drive(self, index: int, due_ns: int) -> None:
+        # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
+        at_ns = due_ns if due_ns > self._tick_ns else self._tick_ns
+        drive = self.drives[index]
+        for _ in range(_MAX_WAKES_PER_INSTANT):
+            drive.wake(at_ns)
+            self._ask_wake(index)
+            if self._wakes[index] > at_ns:
+                break
+        else:
+            # A drive that always wants more at one instant must not stop the others: it goes on at the next tick.
+            self._wakes[index] = self._next_tick_ns
+        self._exchange(at_ns)
+
+    def _run_tick(self, now_ns: int) -> None:
+        plant = self.plant
+        plant.advance(self._torques, self._brakes)
+        self._tick += 1
+        self._tick_ns = now_ns
+        self._next_tick_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
+        if plant.torn_at_s is not None and not self._has_tripped:
+            self._trip_all(plant.torn_at_s, now_ns)
+        for index, drive in enumerate(self.drives):
+            axis = self.axes[index]
+            if axis.resolver_noise_counts > 0.0:
+                self._noises[index] = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
+            counts = self._quantise(index, plant.angle(index))
+            velocity = float((counts - self._counts[index]) * SERVO_RATE_HZ)
+            self._counts[index] = counts
+            self._velocities[index] = velocity
+            drive.on_servo_tick(now_ns, counts, velocity)
+            self._brakes[index] = not drive.brake_released
+            if drive.is_powered:
+                servo = self._servos[index]
+                demand = drive.position_demand_counts
+                if not self._is_powered[index]:
+                    servo.reset(demand, counts)
+                    self._is_powered[index] = True
+                    if self._has_tripped:
+                        # A fault reset does not mend a torn linkage.
+                        drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns)
+                self._torques[index] = servo.update(
+                    demand, counts, drive.gains, drive.torque_offset_Nm, axis.torque_per_volt
+                )
+            else:
+                self._is_powered[index] = False
+                self._torques[index] = 0.0
+            self._ask_wake(index)
+        if self.records.maxlen:
+            self._record(now_ns)
+        self._exchange(now_ns)
+
+    def _exchange(self, now_ns: int) -> None:
+        """Collect what the drives have sent and noticed, and let them hear each other."""
+        for _ in range(_MAX_CROSS_ROUNDS):
+            is_quiet = True
+            for index, drive in enumerate(self.drives):
+                if drive.subscriptions_changed:
+                    self._read_subscriptions()
+                if drive.events:
+                    self._events.extend(drive.events)
+                    drive.events.clear()
+                if drive.outbox:
+                    is_quiet = False
+                    frames = tuple(drive.outbox)
+                    drive.outbox.clear()
+                    self._frames.extend(frames)
+                    for frame in frames:
+                        self._tell_others(index, frame, now_ns)
+            # Drives that answer each other without end go on at the next tick: on a wire it would cost them time too.
+            if is_quiet:
+                return
+
+    def _tell_others(self, sender: int, frame: Frame, now_ns: int) -> None:
+        for index in self._routes.get(frame.cob_id, ()):
+            if index != sender:
+                self.drives[index].receive(frame, now_ns)
+                self._ask_wake(index)
+
+    def _read_subscriptions(self) -> None:
+        routes: dict[int, tuple[int, ...]] = {}
+        for index, drive in enumerate(self.drives):
+            drive.subscriptions_changed = False
+            for cob_id in sorted(drive.cob_ids()):
+                routes[cob_id] = (*routes.get(cob_id, ()), index)
+        self._routes = routes
+
+    def _quantise(self, axis: int, angle_rad: float) -> int:
+        return floor(angle_rad * self._counts_per_rad[axis] + self._noises[axis] + 0.5)
+
+    def _latch_of(self, axis: int) -> Latch:
+        plant = self.plant
+
+        def latch(now_ns: int) -> tuple[int, float, int]:
+            offset_s = min(max((now_ns - self._tick_ns) * 1e-9, 0.0), SERVO_PERIOD_S)
+            return (
+                self._quantise(axis, plant.angle(axis, offset_s)),
+                self._velocities[axis],
+                floor(plant.torque(axis) * self._permille_per_Nm[axis] + 0.5),
+            )
+
+        return latch
+
+    def _trip_all(self, torn_at_s: float, now_ns: int) -> None:
+        self._has_tripped = True
+        angles = tuple(self.plant.angle(axis) for axis in range(len(self.drives)))
+        self._events.append(LinkageTorn(now_ns, torn_at_s, angles))
+        for drive in self.drives:
+            drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns)
+
+    def _skip_to(self, now_ns: int) -> None:
+        """Let the last servo tick not after ``now_ns`` be the next one."""
+        tick = (now_ns - self._start_ns) * 2 // TWO_SERVO_PERIODS_NS
+        if self._start_ns + (tick + 1) * TWO_SERVO_PERIODS_NS // 2 <= now_ns:
+            tick += 1
+        self._events.append(TimeSkipped(now_ns, tick - self._tick - 1))
+        self._tick = tick - 1
+        self._tick_ns = self._start_ns + self._tick * TWO_SERVO_PERIODS_NS // 2
+        self._next_tick_ns = self._start_ns + tick * TWO_SERVO_PERIODS_NS // 2
+        # Wakes missed meanwhile are due once, now, not once for every period they have missed.
+        self._wakes = [max(wake_ns, self._next_tick_ns) for wake_ns in self._wakes]
+
+    def _record(self, now_ns: int) -> None:
+        axes = range(len(self.drives))
+        self.records.append(
+            TickRecord(
+                now_ns,
+                tuple(self.plant.angle(axis) for axis in axes),
+                tuple(self._counts),
+                tuple(drive.position_demand_counts for drive in self.drives),
+                tuple(self._torques),
+                tuple(self.plant.torque(axis) for axis in axes),
+            )
+        )
