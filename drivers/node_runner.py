@@ -12,6 +12,8 @@ from drivers.virtual_time import MAX_WAKES_PER_INSTANT, LivelockError
 
 MAX_WAKES_PER_CALL: Final = 1000
 """Wakes that one ``advance`` makes good at most, so that a host that has fallen behind still looks at its bus."""
+MAX_CATCH_UP_NS: Final = 1_000_000_000
+"""A wake that ``advance`` finds later than this is given the present instead: the time in between has been lost."""
 MAX_BACKLOG_FRAMES: Final = 64
 """Frames kept while the bus takes none; older ones are dropped, they would only tell of the past."""
 LATENESS_WARNING_NS: Final = 100_000_000
@@ -37,9 +39,9 @@ class NodeRunner:
     """Hands one core its wakes and frames in the order of their times, and what it sends to ``transmit``.
 
     Every wake is given the instant at which it was due, even if the host comes to it late, so that a periodic core
-    keeps its phase and misses none. A frame is given its arrival; wakes that were due before it come first. (At the
-    same nanosecond the frame comes first, as in virtual time.) Time never runs backwards: what is older than the last
-    instant handed out, or than ``start_ns``, is given that one.
+    keeps its phase and misses none, up to ``MAX_CATCH_UP_NS``. A frame is given its arrival; wakes that were due before
+    it come first. (At the same nanosecond the frame comes first, as in virtual time.) Time never runs backwards: what
+    is older than the last instant handed out, or than ``start_ns``, is given that one.
     """
 
     def __init__(
@@ -101,6 +103,10 @@ class NodeRunner:
         due_ns = self._next_wake_ns
         if due_ns is None or due_ns > now_ns:
             return
+        lateness_ns = now_ns - max(due_ns, self._time_ns)
+        if lateness_ns > MAX_CATCH_UP_NS:
+            self._note_lateness(lateness_ns)
+            due_ns = now_ns
         for _ in range(MAX_WAKES_PER_CALL):
             self._wake(due_ns, now_ns)
             due_ns = self._next_wake_ns
@@ -133,6 +139,8 @@ class NodeRunner:
             self._frames_sent += 1
 
     def _wake(self, due_ns: int, now_ns: int) -> None:
+        if now_ns - due_ns > self._max_lateness_ns:
+            self._note_lateness(now_ns - max(due_ns, self._time_ns))
         if due_ns > self._time_ns:
             self._time_ns = due_ns
             self._stalled_wakes = 0
@@ -141,8 +149,6 @@ class NodeRunner:
             if self._stalled_wakes > MAX_WAKES_PER_INSTANT:
                 raise LivelockError(0, self._node, self._time_ns, due_ns, self._stalled_wakes)
         self._wakes += 1
-        if now_ns - self._time_ns > self._max_lateness_ns:
-            self._note_lateness(now_ns - self._time_ns)
         self._node.wake(self._time_ns)
         if self._on_wake is not None:
             self._on_wake(self._time_ns, now_ns)
@@ -151,7 +157,7 @@ class NodeRunner:
     def _note_lateness(self, lateness_ns: int) -> None:
         if lateness_ns >= LATENESS_WARNING_NS > self._max_lateness_ns:
             _log.warning("%.0f ms behind real time; is this machine too slow, or too busy?", lateness_ns * 1e-6)
-        self._max_lateness_ns = lateness_ns
+        self._max_lateness_ns = max(lateness_ns, self._max_lateness_ns)
 
     def _settle(self) -> None:
         frames = self._node.take_frames()

@@ -105,7 +105,7 @@ def try_realtime(priority: int = 80) -> list[RealTimeSetting]:
     Timer slack of 1 ns; SCHED_FIFO at ``priority`` (1 to 99), inherited by no child; all memory locked, present and
     future; and the objects that exist now taken out of the garbage collector's view.
     """
-    return [tighten_timers(), _try_fifo(priority), _try_lock_memory(), _freeze_garbage()]
+    return [tighten_timers(), _try_fifo(priority), _try_lock_memory(), freeze_garbage()]
 
 
 def _try_fifo(priority: int) -> RealTimeSetting:
@@ -145,7 +145,8 @@ def _may_lock_memory() -> bool:
     return bool(capabilities >> _CAP_IPC_LOCK & 1)
 
 
-def _freeze_garbage() -> RealTimeSetting:
+def freeze_garbage() -> RealTimeSetting:
+    """Take all objects that exist now out of the garbage collector's view, so that its runs stay short."""
     gc.collect()
     gc.freeze()
     return RealTimeSetting(RealTimeFeature.FROZEN_GARBAGE, True, f"{gc.get_freeze_count()} objects")

@@ -1,0 +1,204 @@
+"""Command line of the emulated machine: ``sim-drive``."""
+
+import contextlib
+import json
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Final, NoReturn
+
+import typer
+
+from config.loading import ConfigError, load_config
+from config.schema import BusSection
+from drivers.errors import BusError, DriveError
+from drivers.node_runner import RunStatistics
+from drivers.ports import interface_is_up, open_port
+from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
+
+_EXIT_BUS: Final = 1
+_EXIT_USE: Final = 2
+
+_EPILOG: Final = """Examples:
+
+\b
+  sim-drive paper                            vcan0 where it is up, else socketcand on 127.0.0.1
+  sim-drive paper --port 0 --json            any free port; a JSON line says which
+  sim-drive paper --interface socketcan --channel vcan1
+  sim-drive paper --duration 60 --ready-file /tmp/ready.json
+
+Connect to it, over socketcand, with python-can:
+
+\b
+  can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=29536, tcp_tune=True)
+
+Exit status: 0 after --duration, SIGINT or SIGTERM; 1 if the bus cannot be opened or is lost; 2 for wrong use or a bad
+configuration.
+"""
+
+app: Final = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the emulated bus is to be found; ``host`` and ``port`` with socketcand alone."""
+
+    interface: str
+    channel: str
+    host: str | None = None
+    port: int | None = None
+
+    def __str__(self) -> str:
+        at = "" if self.host is None else f" at {self.host}:{self.port}"
+        return f"{self.interface} {self.channel}{at}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Announcement:
+    """Whom to tell once the bus is served."""
+
+    as_json: bool
+    file: Path | None
+    descriptor: int | None
+
+    def make(self, name: str, place: _Place) -> None:
+        line = json.dumps(asdict(place))
+        if self.as_json:
+            print(json.dumps({"event": "ready", **asdict(place)}), flush=True)
+        print(f"sim-drive: {name} is on {place}", file=sys.stderr, flush=True)
+        if self.file is not None:
+            # Renamed into place, so that whoever waits for the file never reads half of it.
+            temporary = self.file.with_name(f".{self.file.name}.{os.getpid()}")
+            temporary.write_text(line + "\n", encoding="utf-8")
+            temporary.replace(self.file)
+        if self.descriptor is not None:
+            with open(self.descriptor, "w", encoding="utf-8") as pipe:  # noqa: PTH123 - a descriptor, not a path
+                pipe.write(line + "\n")
+
+
+@app.command(epilog=_EPILOG)
+def sim_drive(
+    config: Annotated[str, typer.Argument(help="Configuration file, or the name of a shipped one: paper.")],
+    interface: Annotated[
+        str | None, typer.Option(help="auto, socketcan, socketcand or a python-can interface  [default: from CONFIG]")
+    ] = None,
+    channel: Annotated[str | None, typer.Option(help="Name of the bus  [default: from CONFIG]")] = None,
+    host: Annotated[str | None, typer.Option(help="socketcand: address to listen at  [default: from CONFIG]")] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help="socketcand: TCP port, 0 for any free one  [default: from CONFIG]"),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in the machine.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after so many seconds  [default: run until told to stop]")
+    ] = None,
+    ready_file: Annotated[
+        Path | None, typer.Option(help="Write where the bus is, as one JSON line, to this file once it is served.")
+    ] = None,
+    ready_fd: Annotated[int | None, typer.Option(min=0, help="The same, to this open file descriptor.")] = None,
+    allow_remote: Annotated[
+        bool, typer.Option("--allow-remote", help="Let --host be an address that other machines can reach.")
+    ] = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Ask for SCHED_FIFO and locked memory, and say what was granted.")
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Report on standard output, one JSON object a line: ready, then stopped.")
+    ] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log clients coming and going.")] = False,
+) -> None:
+    """Emulate the drives of a machine, and the machine that they move, on a CAN bus."""
+    logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="sim-drive: %(message)s")
+    stop = _stop_on_signals()
+    settings = load_config(config)
+    # Here, not above: the maths behind it takes a second to import, which --help and a bad CONFIG need not wait for.
+    from sim_drive.assembly import build_machine
+
+    machine = build_machine(settings, seed)
+    place = _place(settings.bus, interface, channel, host, port)
+    announcement = _Announcement(as_json, ready_file, ready_fd)
+    if realtime:
+        for setting in try_realtime():
+            state = "on" if setting.is_on else "off"
+            print(f"sim-drive: {setting.feature.value}: {state} ({setting.reason})", file=sys.stderr)
+    else:
+        tighten_timers()
+        freeze_garbage()
+
+    def until() -> Callable[[], bool]:
+        if duration is None:
+            return stop
+        end_s = time.monotonic() + duration
+        return lambda: stop() or time.monotonic() >= end_s
+
+    if place.host is None or place.port is None:
+        bus = open_port(place.interface, place.channel)
+        try:
+            announcement.make(settings.name, place)
+            statistics = run_node(machine, bus, until())
+        finally:
+            bus.close()
+    else:
+        from sim_drive.socketcand_server import SocketcandServer
+
+        with SocketcandServer(machine, place.host, place.port, place.channel, allow_remote=allow_remote) as server:
+            real_host, real_port = server.address
+            announcement.make(settings.name, _Place(place.interface, place.channel, real_host, real_port))
+            statistics = server.run(until())
+    _report(statistics, as_json)
+
+
+def main() -> NoReturn:
+    """Run the command line; every foreseen error becomes one sentence on standard error and an exit status."""
+    try:
+        app(prog_name="sim-drive")
+    except ConfigError as error:
+        status, sentences = _EXIT_USE, error.problems
+    except DriveError as error:
+        status, sentences = (_EXIT_BUS if isinstance(error, BusError) else _EXIT_USE), [str(error)]
+    except OSError as error:
+        status, sentences = _EXIT_USE, [f"{error.filename or 'input/output'}: {error.strerror or error}"]
+    else:
+        sys.exit(0)
+    for sentence in sentences:
+        print(f"sim-drive: {sentence}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _place(bus: BusSection, interface: str | None, channel: str | None, host: str | None, port: int | None) -> _Place:
+    chosen_interface = interface or bus.interface
+    chosen_channel = channel or bus.channel
+    if chosen_interface == "auto":
+        chosen_interface = "socketcan" if interface_is_up(chosen_channel) else "socketcand"
+    if chosen_interface != "socketcand":
+        return _Place(chosen_interface, chosen_channel)
+    return _Place(chosen_interface, chosen_channel, host or bus.host, bus.port if port is None else port)
+
+
+def _stop_on_signals() -> Callable[[], bool]:
+    """Make SIGINT and SIGTERM end the run in good order; the answer says whether one has come."""
+    received: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        received.append(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        # Only the main thread of a process may set handlers; elsewhere the caller has other means to stop.
+        with contextlib.suppress(ValueError):
+            signal.signal(number, note)
+    return lambda: bool(received)
+
+
+def _report(statistics: RunStatistics, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps({"event": "stopped", **asdict(statistics)}), flush=True)
+    print(
+        f"sim-drive: stopped after {statistics.wakes} wakes, {statistics.frames_received} frames received, "
+        f"{statistics.frames_sent} sent; latest wake {statistics.max_wake_lateness_ns * 1e-6:.1f} ms late",
+        file=sys.stderr,
+    )
