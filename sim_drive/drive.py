@@ -1,0 +1,391 @@
+"""One emulated CANopen node: NMT, SDO, PDO, SYNC, heartbeats and EMCY around a CiA 402 axis; a core without I/O."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from drivers import objects
+from drivers.frame import Frame
+from drivers.nmt import HEARTBEAT_BASE, MAX_NODE_ID, NMT_COB_ID, NmtCommand, NmtState
+from drivers.node import Event
+from drivers.object_dictionary import ObjectDictionary
+from drivers.sdo import SDO_REQUEST_BASE, AbortCode
+from sim_drive.axis import Axis, Latch, SetPointSource
+from sim_drive.cam_slots import CamDecoder, CamSlots
+from sim_drive.cia402 import Mode, PowerState
+from sim_drive.dictionary import LiveDictionary
+from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
+from sim_drive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from sim_drive.nmt_slave import next_state, parse_command
+from sim_drive.pdo_slave import ReceivePdo, TransmitPdo
+from sim_drive.sdo_server import SdoServer
+from sim_drive.settings import DriveIdentity, DriveSettings
+
+PDO_COUNT: Final = 4
+"""RPDOs and TPDOs that the drive has, each."""
+
+__all__ = ["PDO_COUNT", "Drive", "DriveIdentity", "DriveSettings", "NmtStateChanged"]
+
+_NS_PER_S: Final = 1_000_000_000
+_SYNC_GENERATE: Final = 1 << 30
+_EXTENDED_FRAME: Final = 1 << 29
+_COB_ID_MASK: Final = 0x7FF
+_LAST_COMMUNICATION_INDEX: Final = 0x1FFF
+_LAST_INDEX: Final = 0xFFFF
+
+_Handler = Callable[[bytes, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class NmtStateChanged(Event):
+    """The drive has entered an NMT state."""
+
+    node_id: int
+    state: NmtState
+
+
+class Drive:
+    """The core of one drive. It boots at its first ``wake``, and takes no frame before.
+
+    ``outbox`` and ``events`` are lists that a host may also empty in place; they are never replaced.
+    """
+
+    def __init__(
+        self, node_id: int, dictionary: ObjectDictionary, settings: DriveSettings, decode_cam: CamDecoder
+    ) -> None:
+        """Make a drive that is switched off; ``dictionary`` is what ``load_eds`` gives for this node id.
+
+        Raises:
+            ValueError: ``node_id`` is not 1 to 127, or ``settings.gains`` are not five.
+            KeyError: the dictionary lacks an object that the drive needs.
+        """
+        if not 1 <= node_id <= MAX_NODE_ID:
+            raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
+        self.node_id: Final = node_id
+        self.settings: Final = settings
+        self.outbox: Final[list[Frame]] = []
+        self.events: Final[list[Event]] = []
+        self.dictionary: Final = LiveDictionary(dictionary)
+        self.subscriptions_changed = True
+        """Set whenever ``cob_ids`` gives something else than before; whoever re-reads it sets it back."""
+
+        self._emergency = EmergencyProducer(node_id, self.dictionary, self.outbox, self.events)
+        self.cam_slots: Final = CamSlots(self.dictionary, decode_cam)
+        self.axis: Final = Axis(node_id, self.dictionary, settings, self.cam_slots, self._emergency, self.events)
+        self._sdo = SdoServer(node_id, self.dictionary, self.outbox, round(settings.sdo_timeout_s * _NS_PER_S))
+        self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
+        self._consumer = HeartbeatConsumer(self.dictionary, self._on_heartbeat_change, self._subscribe)
+        self._rpdos = [
+            ReceivePdo(number, self.dictionary, self.axis, self._emergency, self._on_pdo_change)
+            for number in range(1, PDO_COUNT + 1)
+        ]
+        self._tpdos = [
+            TransmitPdo(number, self.dictionary, self.axis, self.outbox, self._on_pdo_change)
+            for number in range(1, PDO_COUNT + 1)
+        ]
+        self._sync_rpdos: tuple[ReceivePdo, ...] = ()
+        self._sync_tpdos: tuple[TransmitPdo, ...] = ()
+        self._event_tpdos: tuple[TransmitPdo, ...] = ()
+        self._sync_cob_id = self.dictionary.entry(objects.COB_ID_SYNC)
+        self._sync_cob_id.on_write = self._on_sync_cob_id
+        self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
+
+        self._handlers: dict[int, _Handler] = {}
+        self.nmt_state = NmtState.BOOT_UP
+        self._boot_due_ns: int | None = 0
+        self._is_powered_on = False
+        self._next_wake_ns: int | None = 0
+        self._is_wake_stale = False
+
+    # -- the seam ------------------------------------------------------------------------------------------------
+
+    def cob_ids(self) -> set[int]:
+        """COB-IDs that the drive listens to."""
+        return set(self._handlers)
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        """Take a frame of another node; what is not for this drive passes by."""
+        handler = self._handlers.get(frame.cob_id)
+        if handler is not None and not frame.is_remote:
+            handler(frame.data, now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        """When heartbeats, SDO or PDO timers, or the boot-up want ``wake``."""
+        if self._is_wake_stale:
+            self._is_wake_stale = False
+            self._next_wake_ns = self._find_next_wake()
+        return self._next_wake_ns
+
+    def wake(self, now_ns: int) -> None:
+        """Do what is due."""
+        self._is_wake_stale = True
+        if self._boot_due_ns is not None:
+            if not self._is_powered_on:
+                self._is_powered_on = True
+                self._boot_due_ns = now_ns + round(self.settings.boot_up_delay_s * _NS_PER_S)
+            if now_ns < self._boot_due_ns:
+                return
+            self._boot_up(now_ns)
+        self._consumer.wake(now_ns)
+        self._sdo.wake(now_ns)
+        if self.nmt_state is NmtState.OPERATIONAL:
+            for tpdo in self._event_tpdos:
+                tpdo.wake(now_ns)
+        self._producer.wake(now_ns, self.nmt_state)
+
+    def take_frames(self) -> list[Frame]:
+        """Frames to be sent, oldest first."""
+        if not self.outbox:
+            return []
+        frames = self.outbox.copy()
+        self.outbox.clear()
+        return frames
+
+    def take_events(self) -> list[Event]:
+        """Events since the last call, oldest first."""
+        events = self.events.copy()
+        self.events.clear()
+        return events
+
+    def _find_next_wake(self) -> int | None:
+        if self._boot_due_ns is not None:
+            return self._boot_due_ns
+        dues = [self._consumer.next_wake_ns(), self._sdo.next_wake_ns(), self._producer.next_wake_ns()]
+        if self.nmt_state is NmtState.OPERATIONAL:
+            dues += [tpdo.due_ns for tpdo in self._event_tpdos]
+        return min((due for due in dues if due is not None), default=None)
+
+    # -- what the machine uses -----------------------------------------------------------------------------------
+
+    def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None:
+        """One servo period, with the resolver's counts since power-on."""
+        self.axis.on_tick(now_ns, shaft_counts)
+        if self._event_tpdos and self.nmt_state is NmtState.OPERATIONAL:
+            for tpdo in self._event_tpdos:
+                if tpdo.poll(now_ns):
+                    self._is_wake_stale = True
+
+    @property
+    def latch(self) -> Latch:
+        """Where actual values come from: called with an instant, gives shaft counts, counts/s and per mille torque."""
+        return self.axis.latch
+
+    @latch.setter
+    def latch(self, latch: Latch) -> None:
+        self.axis.latch = latch
+
+    @property
+    def position_demand_counts(self) -> float:
+        """Position demand at the last servo tick, in shaft counts."""
+        return self.axis.position_demand_counts
+
+    @property
+    def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
+        """Torque to be added to the position controller's."""
+        return self.axis.torque_offset_Nm
+
+    @property
+    def torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
+        """Max torque 6072h: what the amplifier may give at most."""
+        return self.axis.torque_limit_Nm
+
+    @property
+    def is_powered(self) -> bool:
+        """Whether the amplifier may put torque on the motor."""
+        return self.axis.is_powered
+
+    @property
+    def brake_released(self) -> bool:
+        """Whether the holding brake is open: exactly while there is torque to hold the axis."""
+        return self.axis.is_powered
+
+    @property
+    def gains(self) -> tuple[int, ...]:
+        """K_P, K_I, K_D, K_V, K_F of 3020h, over 256."""
+        return self.axis.gains
+
+    @property
+    def power_state(self) -> PowerState:
+        """State of the CiA 402 state machine."""
+        return self.axis.state
+
+    @property
+    def mode(self) -> Mode:
+        """Active mode of operation."""
+        return self.axis.mode
+
+    def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
+        """Make the drive fault: EMCY, fault reaction, fault. ``persists`` until ``end_trip`` is called."""
+        self.axis.trip(error_code, error_register_bits, now_ns, persists=persists)
+
+    def end_trip(self, error_code: int, now_ns: int) -> None:
+        """The cause of a persisting trip has gone, so that a fault reset is accepted again."""
+        self._emergency.end_cause(error_code, now_ns)
+
+    # -- NMT -----------------------------------------------------------------------------------------------------
+
+    def _on_nmt(self, data: bytes, now_ns: int) -> None:
+        command = parse_command(data, self.node_id)
+        if command is None:
+            return
+        self._is_wake_stale = True
+        is_reset = command in {NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION}
+        state = next_state(command)
+        if state is self.nmt_state:
+            return
+        self._enter(state, now_ns)
+        if state is NmtState.STOPPED or command is NmtCommand.RESET_COMMUNICATION:
+            self._lose_connection(now_ns)
+        if is_reset:
+            self._reset(command is NmtCommand.RESET_NODE, now_ns)
+
+    def _lose_connection(self, now_ns: int) -> None:
+        """An axis that is enabled does not go on without its master."""
+        if self.axis.is_powered:
+            self.axis.trip(EmergencyCode.COMMUNICATION, ErrorRegister.COMMUNICATION, now_ns)
+
+    def _reset(self, is_whole_node: bool, now_ns: int) -> None:
+        last_index = _LAST_INDEX if is_whole_node else _LAST_COMMUNICATION_INDEX
+        self.dictionary.restore_defaults(objects.DEVICE_TYPE, last_index)
+        self._sdo.reset()
+        if is_whole_node:
+            self._emergency.forget()
+            self.cam_slots.restore()
+            self.axis.restore()
+        self._emergency.restore()
+        self._handlers = {}
+        self._boot_due_ns = now_ns + round(self.settings.boot_up_delay_s * _NS_PER_S)
+        if now_ns >= self._boot_due_ns:
+            self._boot_up(now_ns)
+
+    def _boot_up(self, now_ns: int) -> None:
+        self._boot_due_ns = None
+        for pdo in (*self._rpdos, *self._tpdos):
+            pdo.restore(now_ns)
+        self._producer.restore(now_ns)
+        self._consumer.restore()
+        self._on_pdo_change(now_ns)
+        self._producer.send_boot_up()
+        self._enter(NmtState.PRE_OPERATIONAL, now_ns)
+
+    def _enter(self, state: NmtState, now_ns: int) -> None:
+        self.nmt_state = state
+        self.events.append(NmtStateChanged(now_ns, self.node_id, state))
+        self._emergency.is_silent = state in {NmtState.STOPPED, NmtState.BOOT_UP}
+        self._sdo.reset()
+        for rpdo in self._rpdos:
+            rpdo.pending = None
+        if state is NmtState.OPERATIONAL:
+            for tpdo in self._tpdos:
+                if tpdo.is_valid:
+                    tpdo.begin(now_ns)
+
+    # -- subscriptions -------------------------------------------------------------------------------------------
+
+    def _on_pdo_change(self, now_ns: int) -> None:
+        tpdos = [tpdo for tpdo in self._tpdos if tpdo.is_valid]
+        self._sync_tpdos = tuple(tpdo for tpdo in tpdos if not tpdo.is_event_driven)
+        self._event_tpdos = tuple(tpdo for tpdo in tpdos if tpdo.is_event_driven)
+        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if rpdo.is_valid and rpdo.is_synchronous)
+        self._is_wake_stale = True
+        self._subscribe()
+
+    def _subscribe(self) -> None:
+        handlers: dict[int, _Handler] = {}
+        for rpdo in self._rpdos:
+            if rpdo.is_valid:
+                _add(handlers, rpdo.cob_id, self._rpdo_handler(rpdo))
+        for node_id in self._consumer.node_ids:
+            _add(handlers, HEARTBEAT_BASE + node_id, self._heartbeat_handler(node_id))
+        _add(handlers, self._sync_cob_id.value & _COB_ID_MASK, self._on_sync)
+        _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
+        _add(handlers, NMT_COB_ID, self._on_nmt)
+        self._handlers = handlers
+        self._is_wake_stale = True
+        self.subscriptions_changed = True
+
+    def _rpdo_handler(self, rpdo: ReceivePdo) -> _Handler:
+        receive = rpdo.receive
+
+        def handle(data: bytes, now_ns: int) -> None:
+            if self.nmt_state is NmtState.OPERATIONAL:
+                receive(data, now_ns)
+
+        return handle
+
+    def _heartbeat_handler(self, node_id: int) -> _Handler:
+        def handle(data: bytes, now_ns: int) -> None:
+            self._is_wake_stale = True
+            self._consumer.receive(node_id, data, now_ns)
+
+        return handle
+
+    def _on_sdo(self, data: bytes, now_ns: int) -> None:
+        if self.nmt_state in {NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL}:
+            self._is_wake_stale = True
+            self._sdo.receive(data, now_ns)
+
+    # -- SYNC ----------------------------------------------------------------------------------------------------
+
+    def _on_sync(self, data: bytes, now_ns: int) -> None:
+        """Sample and send first, then let the demands act that came before this SYNC."""
+        if self.nmt_state is not NmtState.OPERATIONAL:
+            return
+        if data:
+            self._emergency.raise_error(
+                EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
+            )
+            return
+        if self._emergency.has_errors:
+            self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
+        axis = self.axis
+        axis.sample(now_ns)
+        for tpdo in self._sync_tpdos:
+            tpdo.on_sync(now_ns)
+        axis.source = SetPointSource.SYNC
+        for rpdo in self._sync_rpdos:
+            pending = rpdo.pending
+            if pending is not None:
+                rpdo.pending = None
+                rpdo.apply(pending, now_ns)
+        axis.on_sync(now_ns)
+        axis.source = SetPointSource.SDO
+
+    def _on_sync_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
+        if value & (_SYNC_GENERATE | _EXTENDED_FRAME) or not value & _COB_ID_MASK:
+            return AbortCode.VALUE_RANGE_EXCEEDED
+        self._sync_cob_id.value = value
+        self._subscribe()
+        return None
+
+    # -- heartbeat of the master -----------------------------------------------------------------------------------
+
+    def _on_heartbeat_change(self, node_id: int, is_lost: bool, now_ns: int) -> None:
+        if not is_lost:
+            self._emergency.end_cause(EmergencyCode.HEARTBEAT, now_ns)
+            return
+        if self.axis.is_powered:
+            self.axis.trip(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, persists=True)
+        else:
+            self._emergency.raise_error(
+                EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=True
+            )
+        action = self._communication_error.value
+        if action == 0 and self.nmt_state is NmtState.OPERATIONAL:
+            self._enter(NmtState.PRE_OPERATIONAL, now_ns)
+        elif action == 2 and self.nmt_state is not NmtState.STOPPED:
+            self._enter(NmtState.STOPPED, now_ns)
+
+
+def _add(handlers: dict[int, _Handler], cob_id: int, handler: _Handler) -> None:
+    """Let ``handler`` take frames of ``cob_id``, after those that already do."""
+    first = handlers.get(cob_id)
+    if first is None:
+        handlers[cob_id] = handler
+        return
+
+    def both(data: bytes, now_ns: int) -> None:
+        first(data, now_ns)
+        handler(data, now_ns)
+
+    handlers[cob_id] = both

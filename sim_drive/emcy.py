@@ -1,0 +1,199 @@
+"""EMCY producer (CiA 301, 7.2.7) with the error register 1001h and the pre-defined error field 1003h."""
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag, unique
+from typing import Final
+
+from drivers.frame import Frame
+from drivers.node import Event
+from drivers.objects import COB_ID_EMCY, ERROR_CODE, ERROR_REGISTER, PREDEFINED_ERROR_FIELD
+from drivers.pdo import PDO_COB_ID_INVALID
+from drivers.sdo import AbortCode
+from sim_drive.dictionary import Entry, LiveDictionary
+
+ERROR_HISTORY_LENGTH: Final = 8
+"""Errors that 1003h remembers."""
+
+_EMCY: Final = struct.Struct("<HB5s")
+_COB_ID_MASK: Final = 0x7FF
+_EXTENDED_FRAME: Final = 1 << 29
+
+
+@unique
+class EmergencyCode(IntEnum):
+    """Emergency error codes that the drive raises by itself (CiA 301, table 26; CiA 402-1; FF00h: our own)."""
+
+    NO_ERROR = 0x0000
+    COMMUNICATION = 0x8100
+    """The NMT master has stopped the node, or reset its communication, while the axis was enabled."""
+    HEARTBEAT = 0x8130
+    PDO_TOO_SHORT = 0x8210
+    PDO_TOO_LONG = 0x8220
+    SYNC_LENGTH = 0x8240
+    FOLLOWING_ERROR = 0x8611
+    SYNC_CONTROLLER = 0x8700
+    """Set-points have failed to come for too many SYNC periods."""
+    CAM_NOT_VALID = 0xFF10
+    """Camming was asked for without a valid table in the selected slot."""
+    CAM_JUMP = 0xFF11
+    """Engaging the cam would make the axis jump."""
+
+
+class ErrorRegister(IntFlag):
+    """Bits of 1001h (CiA 301, table 39)."""
+
+    NONE = 0
+    GENERIC = 0x01
+    CURRENT = 0x02
+    VOLTAGE = 0x04
+    TEMPERATURE = 0x08
+    COMMUNICATION = 0x10
+    DEVICE_PROFILE = 0x20
+    MANUFACTURER = 0x80
+
+
+@dataclass(frozen=True, slots=True)
+class EmergencyRaised(Event):
+    """The drive has noticed an error, or (code 0) lost the last one."""
+
+    node_id: int
+    code: int
+    register: int
+
+
+@dataclass(slots=True)
+class _ActiveError:
+    register: int
+    is_fault: bool
+    persists: bool
+
+
+class EmergencyProducer:
+    """Knows which errors are active, and tells of every change."""
+
+    __slots__ = (
+        "_active",
+        "_cob_id",
+        "_code",
+        "_events",
+        "_history",
+        "_node_id",
+        "_outbox",
+        "_register",
+        "has_errors",
+        "is_silent",
+    )
+
+    def __init__(self, node_id: int, dictionary: LiveDictionary, outbox: list[Frame], events: list[Event]) -> None:
+        self._node_id = node_id
+        self._outbox = outbox
+        self._events = events
+        self._active: dict[int, _ActiveError] = {}
+        self._register = dictionary.entry(ERROR_REGISTER)
+        self._code = dictionary.entry(ERROR_CODE)
+        self._cob_id = dictionary.entry(COB_ID_EMCY)
+        self._cob_id.on_write = self._on_cob_id
+        self._history = [dictionary.entry(PREDEFINED_ERROR_FIELD, n) for n in range(ERROR_HISTORY_LENGTH + 1)]
+        self._history[0].on_write = self._on_history_cleared
+        for number, entry in enumerate(self._history[1:], start=1):
+            entry.on_read = self._history_reader(number, entry)
+        self.has_errors = False
+        """Whether any error is active."""
+        self.is_silent = True
+        """No EMCY is sent, as before the boot-up and in NMT state stopped; errors are still remembered."""
+
+    @property
+    def has_persisting_fault(self) -> bool:
+        """Whether the cause of an error is still there, so that a fault reset has to be refused."""
+        return any(error.persists for error in self._active.values())
+
+    def is_active(self, code: int) -> bool:
+        """Whether this error has been raised and not cleared."""
+        return code in self._active
+
+    def restore(self) -> None:
+        """Bring 1001h up to date after the dictionary's defaults were restored."""
+        self._register.value = self._combined_register()
+
+    def forget(self) -> None:
+        """Lose all errors without a word, save those whose cause persists."""
+        self._active = {code: error for code, error in self._active.items() if error.persists}
+        self.restore()
+
+    def raise_error(self, code: int, register: int, now_ns: int, *, is_fault: bool, persists: bool) -> None:
+        """Note an error and tell of it, unless it is active already.
+
+        ``is_fault``: it stays active until a fault reset. ``persists``: its cause stays until ``end_cause``.
+        """
+        known = self._active.get(code)
+        if known is not None:
+            known.is_fault = known.is_fault or is_fault
+            known.persists = persists
+            return
+        self._active[code] = _ActiveError(register | ErrorRegister.GENERIC, is_fault, persists)
+        self._code.value = code
+        history = self._history
+        for place in range(ERROR_HISTORY_LENGTH, 1, -1):
+            history[place].value = history[place - 1].value
+        history[1].value = code
+        history[0].value = min(history[0].value + 1, ERROR_HISTORY_LENGTH)
+        self._tell(code, now_ns)
+
+    def end_cause(self, code: int, now_ns: int) -> None:
+        """The cause of an error has gone: the error is over, unless it has led to a fault that is still to be reset."""
+        error = self._active.get(code)
+        if error is None:
+            return
+        error.persists = False
+        if not error.is_fault:
+            del self._active[code]
+            self._tell_recovery(now_ns)
+
+    def reset_fault(self, now_ns: int) -> None:
+        """Clear every error (there must be none that persists), as a fault reset does."""
+        if self._active:
+            self._active.clear()
+            self._tell_recovery(now_ns)
+        self._code.value = EmergencyCode.NO_ERROR
+
+    def _combined_register(self) -> int:
+        self.has_errors = bool(self._active)
+        register = 0
+        for error in self._active.values():
+            register |= error.register
+        return register
+
+    def _tell_recovery(self, now_ns: int) -> None:
+        if self._active:
+            self._register.value = self._combined_register()
+        else:
+            self._tell(EmergencyCode.NO_ERROR, now_ns)
+
+    def _tell(self, code: int, now_ns: int) -> None:
+        register = self._combined_register()
+        self._register.value = register
+        self._events.append(EmergencyRaised(now_ns, self._node_id, code, register))
+        cob_id = self._cob_id.value
+        if not self.is_silent and not cob_id & PDO_COB_ID_INVALID:
+            self._outbox.append(Frame(cob_id & _COB_ID_MASK, _EMCY.pack(code, register, b"\0\0\0\0\0")))
+
+    def _on_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
+        current = self._cob_id.value
+        is_moved = (value ^ current) & _COB_ID_MASK and not (current | value) & PDO_COB_ID_INVALID
+        if value & _EXTENDED_FRAME or is_moved or not value & _COB_ID_MASK:
+            return AbortCode.VALUE_RANGE_EXCEEDED
+        return None
+
+    def _on_history_cleared(self, value: int, now_ns: int) -> AbortCode | None:
+        if value:
+            return AbortCode.VALUE_RANGE_EXCEEDED
+        for entry in self._history[1:]:
+            entry.value = 0
+        return None
+
+    def _history_reader(self, number: int, entry: Entry):
+        def read(now_ns: int) -> int:
+            return entry.value if number <= self._history[0].value else AbortCode.NO_DATA_AVAILABLE
+
+        return read

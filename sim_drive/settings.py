@@ -1,0 +1,35 @@
+"""What distinguishes one emulated drive from another: identity, encoder, motor, and limits of its own making."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class DriveIdentity:
+    """Identity object 1018h."""
+
+    vendor_id: int = 0x000004D2
+    """A placeholder: CiA assigns vendor ids, and the emulator has none."""
+    product_code: int = 0x00001024
+    revision_number: int = 0x00010000
+    serial_number: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """Everything about a drive that is not in its EDS file; the defaults are those of the file that ships."""
+
+    identity: DriveIdentity = field(default_factory=DriveIdentity)
+    counts_per_revolution: int = 4096
+    rated_torque_Nm: float = 1.5
+    gains: tuple[int, ...] | None = None
+    """Defaults of 3020h (K_P, K_I, K_D, K_V, K_F over 256); None keeps those of the EDS file."""
+    initial_offset_counts: int = 0
+    """Position actual value minus shaft counts after power-on, before any homing."""
+    missing_set_point_limit: int = 5
+    """Interpolation periods without a set-point after which an enabled axis faults (8700h); 0 never does."""
+    cam_jump_window_counts: int = 64
+    """How far the cam's demand may be from the axis when it is engaged."""
+    sdo_timeout_s: float = 1.0
+    """How long a client may pause within a segmented transfer."""
+    boot_up_delay_s: float = 0.0
+    """From power-on or a reset to the boot-up message."""
