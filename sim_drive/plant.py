@@ -235,25 +235,25 @@ def advance_five_bar(
         vb2, vb5 = v2 + half * p2, v5 + half * p5
         xb2, xb5 = x2 + half * v2, x5 + half * v5
         sine = abs(linkage_sine(dynamics, xb2, xb5, closure))
-        worst = sine if not sine >= worst else worst
+        worst = sine if sine < worst else worst
         q2, q5, _, _, _ = _smooth_acceleration(
             dynamics, closure, xb2, xb5, vb2, vb5, middle2, middle5, viscous2, viscous5
         )
         vc2, vc5 = v2 + half * q2, v5 + half * q5
         xc2, xc5 = x2 + half * vb2, x5 + half * vb5
         sine = abs(linkage_sine(dynamics, xc2, xc5, closure))
-        worst = sine if not sine >= worst else worst
+        worst = sine if sine < worst else worst
         r2, r5, _, _, _ = _smooth_acceleration(
             dynamics, closure, xc2, xc5, vc2, vc5, middle2, middle5, viscous2, viscous5
         )
         vd2, vd5 = v2 + step_s * r2, v5 + step_s * r5
         xd2, xd5 = x2 + step_s * vc2, x5 + step_s * vc5
         sine = abs(linkage_sine(dynamics, xd2, xd5, closure))
-        worst = sine if not sine >= worst else worst
+        worst = sine if sine < worst else worst
         s2, s5, m11, m12, m22 = _smooth_acceleration(
             dynamics, closure, xd2, xd5, vd2, vd5, end2, end5, viscous2, viscous5
         )
-        # The comparison is also false for NaN, which is what a linkage that does not close gives.
+        # A stage in which the linkage does not close is NaN, and so is every stage that follows it.
         if not worst >= singular_sine or isnan(s2) or isnan(s5):
             torn = step + 1
             v2 = v5 = a2 = a5 = torque2 = torque5 = 0.0

@@ -176,10 +176,14 @@ def test_a_frame_after_a_missed_wake_finds_the_machine_up_to_date() -> None:
 def test_very_late_ticks_are_left_out_and_said() -> None:
     bench = Bench()
     bench.run_until(10 * MS)
+    bench.drives[1].wakes_ns = [20 * MS, 30 * MS, 40 * MS]
+    bench.machine.receive(SYNC, 10 * MS)
     bench.log.clear()
     late_ns = 1_000_000 * SECOND + 5
     bench.machine.wake(late_ns)
     assert bench.ticks() == [1_000_000 * SECOND]
+    # The drive's missed wakes are one, after the tick.
+    assert [entry[:3] for entry in bench.log[2:]] == [("wake", "b", 1_000_000 * SECOND)]
     assert bench.machine.take_events() == [TimeSkipped(late_ns, 1_000_000 * 1024 - 10 - 1)]
     assert bench.machine.next_wake_ns() == 1_000_000 * SECOND + 976_562
     bench.machine.wake(1_000_000 * SECOND + 976_562)
@@ -252,7 +256,7 @@ def test_drives_hear_each_other_after_the_frame_that_caused_it() -> None:
     tpdo_a, tpdo_b = Frame(0x181, b"\x01"), Frame(0x182, b"\x02")
     a.answers = {0x080: [tpdo_a]}
     b.answers = {0x080: [tpdo_b]}
-    b.listens = {0x080, 0x181}
+    a.listens = b.listens = {0x080, 0x181}
     b.subscriptions_changed = True
     bench.run_until(MS)
     bench.log.clear()
