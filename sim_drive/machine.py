@@ -37,19 +37,32 @@ Latch = Callable[[int], tuple[int, float, int]]
 class MachineDrive(Protocol):
     """What the machine needs of a drive; `sim_drive.drive` has the real one."""
 
-    outbox: list[Frame]
-    """Frames to send, oldest first; the machine empties it in place."""
-    events: list[Event]
-    """Events, oldest first; the machine empties it in place."""
     subscriptions_changed: bool
     """Set by the drive when `cob_ids` has changed, reset by the machine."""
-    latch: Latch
-    """Set by the machine: what the drive's resolver and amplifier show at an instant."""
 
+    @property
+    def outbox(self) -> list[Frame]:
+        """Frames to send, oldest first; the machine empties it in place."""
+        ...
+
+    @property
+    def events(self) -> list[Event]:
+        """Events, oldest first; the machine empties it in place."""
+        ...
+
+    @property
+    def latch(self) -> Latch:
+        """Set by the machine: what the drive's resolver and amplifier show at an instant."""
+        ...
+
+    @latch.setter
+    def latch(self, latch: Latch) -> None: ...
     @property
     def position_demand_counts(self) -> float: ...
     @property
     def torque_offset_Nm(self) -> float: ...  # noqa: N802
+    @property
+    def torque_limit_Nm(self) -> float: ...  # noqa: N802
     @property
     def is_powered(self) -> bool: ...
     @property
@@ -61,7 +74,7 @@ class MachineDrive(Protocol):
     def next_wake_ns(self) -> int | None: ...
     def wake(self, now_ns: int) -> None: ...
     def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None: ...
-    def trip(self, error_code: int, error_register_bits: int, now_ns: int) -> None: ...
+    def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,10 +319,15 @@ class EmulatedMachine:
                     servo.reset(demand, counts)
                     self._is_powered[index] = True
                     if self._has_tripped:
-                        # A fault reset does not mend a torn linkage.
-                        drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns)
+                        # Neither a fault reset nor switching the drive off and on mends a torn linkage.
+                        drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
                 self._torques[index] = servo.update(
-                    demand, counts, drive.gains, drive.torque_offset_Nm, axis.torque_per_volt
+                    demand,
+                    counts,
+                    drive.gains,
+                    drive.torque_offset_Nm,
+                    axis.torque_per_volt,
+                    drive.torque_limit_Nm,
                 )
             else:
                 self._is_powered[index] = False
@@ -375,7 +393,7 @@ class EmulatedMachine:
         angles = tuple(self.plant.angle(axis) for axis in range(len(self.drives)))
         self._events.append(LinkageTorn(now_ns, torn_at_s, angles))
         for drive in self.drives:
-            drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns)
+            drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
     def _skip_to(self, now_ns: int) -> None:
         """Let the last servo tick not after ``now_ns`` be the next one."""

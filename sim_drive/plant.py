@@ -346,8 +346,6 @@ class CoupledPlant:
 
     __slots__ = ("_dynamics", "_settings", "_state", "_step_s", "_steps", "_torn_at_s", "_values", "parameters")
 
-    axis_count: Final = 2
-
     def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float) -> None:
         self.parameters = parameters
         dynamics = parameters.dynamics
@@ -391,6 +389,11 @@ class CoupledPlant:
             brake2,
             brake5,
         )
+
+    @property
+    def axis_count(self) -> int:
+        """Two: the CV axis and the servo axis."""
+        return 2
 
     @property
     def torn_at_s(self) -> float | None:
@@ -455,8 +458,6 @@ class FreeAxisPlant:
 
     __slots__ = ("_accelerations", "_angles", "_settings", "_step_s", "_substeps", "_torques", "_velocities", "axes")
 
-    torn_at_s: Final = None
-
     def __init__(
         self,
         axes: Sequence[FreeAxisParameters],
@@ -496,7 +497,13 @@ class FreeAxisPlant:
 
     @property
     def axis_count(self) -> int:
+        """Number of axes."""
         return len(self.axes)
+
+    @property
+    def torn_at_s(self) -> None:
+        """Always None: there is no linkage to tear."""
+        return None
 
     def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
         """One servo period (1/1024 s) under constant torque commands (N m), one of each an axis."""

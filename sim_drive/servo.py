@@ -6,7 +6,7 @@ of a 12-bit converter that spans +-10 V, that is 10/2048 V a unit.
 
 from collections.abc import Sequence
 from enum import IntEnum, unique
-from math import floor
+from math import floor, inf
 from typing import Final
 
 SERVO_RATE_HZ: Final = 1024
@@ -93,12 +93,13 @@ class ServoLoop:
         gains: Sequence[int],
         torque_offset_Nm: float,
         torque_per_volt: float,
+        torque_limit_Nm: float = inf,
     ) -> float:
         """Torque command for the coming servo period, in N m.
 
         ``gains`` are K_P, K_I, K_D, K_V, K_F as integers over 256. ``torque_offset_Nm`` is added at the converter's
         input: it shares the 12 bits and the limits with the controller. ``torque_per_volt`` (N m / V) is the
-        amplifier's.
+        amplifier's. ``torque_limit_Nm`` narrows the output's limits to whole units within it.
         """
         gain_p, gain_i, gain_d, gain_v, gain_f = gains
         demand = float(floor(demand_counts + 0.5)) if self._round_error else demand_counts
@@ -112,12 +113,18 @@ class ServoLoop:
             - gain_v * (actual_counts - self._position_before)
             + gain_f * (demand_fed - self._demand_before)
         ) / GAIN_SCALE + torque_offset_Nm / (torque_per_volt * VOLT_PER_UNIT)
-        if wanted >= OUTPUT_MAXIMUM:
-            output = OUTPUT_MAXIMUM
+        maximum = OUTPUT_MAXIMUM
+        minimum = OUTPUT_MINIMUM
+        limit = torque_limit_Nm / (torque_per_volt * VOLT_PER_UNIT)
+        if limit < -OUTPUT_MINIMUM:
+            maximum = floor(limit)
+            minimum = -maximum
+        if wanted >= maximum:
+            output = maximum
             if error < 0.0:
                 self._error_sum = error_sum
-        elif wanted <= OUTPUT_MINIMUM:
-            output = OUTPUT_MINIMUM
+        elif wanted <= minimum:
+            output = minimum
             if error > 0.0:
                 self._error_sum = error_sum
         else:

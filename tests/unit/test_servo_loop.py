@@ -68,6 +68,19 @@ def test_torque_offset_shares_the_converter() -> None:
     assert servo.update(4.0, 0, (256, 0, 0, 0, 0), -6 * NM_PER_UNIT, NM_PER_VOLT) == pytest.approx(-2 * NM_PER_UNIT)
 
 
+def test_a_torque_limit_narrows_the_converter_to_whole_units_within_it() -> None:
+    servo = started()
+    for error, units in ((5000.0, 45), (-5000.0, -45), (44.0, 44), (-45.0, -45)):
+        servo.update(error, 0, (256, 0, 0, 0, 0), 0.0, NM_PER_VOLT, 0.1)
+        assert servo.output_units == units  # 0.1 N m are 45.5 units
+    # The sum stands still at the narrower limit too: 44 is within it, 88 is not.
+    servo.reset(0.0, 0)
+    for _ in range(100):
+        servo.update(44.0, 0, (0, 256, 0, 0, 0), 0.0, NM_PER_VOLT, 0.1)
+    servo.update(-1.0, 0, (0, 256, 0, 0, 0), 0.0, NM_PER_VOLT, 0.1)
+    assert servo.output_units == 43
+
+
 def test_the_sum_does_not_wind_up() -> None:
     servo = started()
     gains = (256, 256, 0, 0, 0)

@@ -50,6 +50,7 @@ class FakeDrive:
         self.latch: Latch = no_latch
         self.position_demand_counts = 0.0
         self.torque_offset_Nm = 0.0
+        self.torque_limit_Nm = 4.5
         self.is_powered = False
         self.brake_released = False
         self.gains: tuple[int, ...] = (4000, 0, 0, 45_000, 45_000)
@@ -82,7 +83,8 @@ class FakeDrive:
         self.log.append(("tick", self.name, now_ns, shaft_counts, velocity_counts_per_s))
         self.position_demand_counts = self.demand(now_ns)
 
-    def trip(self, error_code: int, error_register_bits: int, now_ns: int) -> None:
+    def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
+        assert persists
         self.trips.append(error_code)
         self.power(False)
 
@@ -332,6 +334,18 @@ def test_latch_gives_torque_in_per_mille_of_rated_torque() -> None:
     bench.run_until(50 * MS)
     # -0.2 N m is -91 units of 2.197 mN m, -0.19995 N m.
     assert drive.latch(50 * MS)[2] == -400
+
+
+def test_the_drives_torque_limit_holds() -> None:
+    bench = Bench(1)
+    drive = bench.drives[0]
+    drive.power()
+    drive.gains = (0, 0, 0, 0, 0)
+    drive.torque_offset_Nm = 3.0
+    drive.torque_limit_Nm = 0.5
+    bench.run_until(50 * MS)
+    # 227 whole units of 2.197 mN m are within 0.5 N m.
+    assert bench.plant.torque(0) == pytest.approx(227 * 10 / 2048 * 0.45, rel=1e-9)
 
 
 def test_an_axis_without_power_gets_no_torque_and_starts_anew() -> None:
