@@ -325,14 +325,17 @@ def _parse(opcode: int, body: bytes, offset: int) -> Scanned:
     return record
 
 
-def split_messages(records: bytes, offset: int) -> dict[int, list[bytes] | NDArray[np.uint8]]:
-    """Bodies of the messages in a chunk's records, by channel id.
+Bodies = list[bytes] | NDArray[np.uint8]
+"""Messages without their headers; an array, shape (messages, bytes), where all have one size and channel."""
 
-    An array of shape (messages, bytes) where all are of one channel and size, as this writer makes them, else a list.
+
+def split_records(records: bytes, offset: int) -> tuple[dict[int, Bodies], list[Channel]]:
+    """Bodies of the messages in a chunk's records, by channel id, and the channels that are declared there.
+
     Raises ``McapError``; ``offset`` is where the chunk lies, for its message.
     """
     if not records:
-        return {}
+        return {}, []
     if len(records) >= _MESSAGE_HEADER.itemsize:
         head = np.frombuffer(records, _MESSAGE_HEADER, 1)[0]
         total = int(head["length"]) + _RECORD_HEADER.size
@@ -340,8 +343,9 @@ def split_messages(records: bytes, offset: int) -> dict[int, list[bytes] | NDArr
             rows = np.frombuffer(records, np.uint8).reshape(-1, total)
             same = (rows[:, : _RECORD_HEADER.size + 2] == rows[0, : _RECORD_HEADER.size + 2]).all()
             if same:
-                return {int(head["channel"]): rows[:, _MESSAGE_HEADER.itemsize :]}
-    bodies: dict[int, list[bytes] | NDArray[np.uint8]] = {}
+                return {int(head["channel"]): rows[:, _MESSAGE_HEADER.itemsize :]}, []
+    bodies: dict[int, list[bytes]] = {}
+    channels: list[Channel] = []
     position = 0
     while position < len(records):
         if position + _RECORD_HEADER.size > len(records):
@@ -352,7 +356,8 @@ def split_messages(records: bytes, offset: int) -> dict[int, list[bytes] | NDArr
             raise McapError(offset, "a chunk ends within a record")
         if opcode == Opcode.MESSAGE:
             (channel,) = struct.unpack_from("<H", records, start)
-            known = bodies.setdefault(channel, [])
-            if isinstance(known, list):
-                known.append(records[start + _MESSAGE_OVERHEAD : position])
-    return bodies
+            bodies.setdefault(channel, []).append(records[start + _MESSAGE_OVERHEAD : position])
+        elif opcode == Opcode.CHANNEL:
+            declared = _parse(opcode, records[start:position], offset)
+            channels += [declared] if isinstance(declared, Channel) else []
+    return dict(bodies), channels

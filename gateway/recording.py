@@ -21,7 +21,7 @@ from mcap.records import Attachment, Channel, Footer, Message, Metadata
 from numpy.typing import NDArray
 
 from gateway.errors import UsageError
-from gateway.mcap_file import McapError, McapWriter, RawChunk, Scanned, scan, split_messages
+from gateway.mcap_file import Bodies, McapError, McapWriter, RawChunk, Scanned, scan, split_records
 from gateway.ring import FRAME_DTYPE, FRAME_STRUCT, FrameArray, RunEvent
 from gateway.run_constants import RunConstants
 from gateway.sample import CDR_HEADER, SAMPLE_SCHEMA_NAME, SampleArray, SampleLayout
@@ -293,7 +293,8 @@ class Recording:
         for chunk in self._frame_chunks:
             if isinstance(chunk, RawChunk):
                 try:
-                    bodies = _rows(next(iter(split_messages(chunk.messages(), chunk.offset).values())), chunk.offset)
+                    found, _ = split_records(chunk.messages(), chunk.offset)
+                    bodies = _rows(next(iter(found.values())), chunk.offset)
                 except McapError as error:
                     raise RecordingError(self.path, f"is damaged: {error}") from error
             else:
@@ -331,14 +332,16 @@ class _Contents:
             self.is_complete = True
 
     def _take_chunk(self, chunk: RawChunk) -> None:
-        found = split_messages(chunk.messages(), chunk.offset)
+        found, channels = split_records(chunk.messages(), chunk.offset)
+        for declared in channels:
+            self.topics[declared.id] = declared.topic
         if [self.topics.get(channel) for channel in found] == [FRAMES_TOPIC]:
             self.frames.append(chunk)  # kept packed: most reports never look at the frames
             return
         for channel, bodies in found.items():
             self._take_bodies(channel, bodies, chunk.offset)
 
-    def _take_bodies(self, channel: int, bodies: list[bytes] | NDArray[np.uint8], offset: int) -> None:
+    def _take_bodies(self, channel: int, bodies: Bodies, offset: int) -> None:
         topic = self.topics.get(channel)
         if topic == CYCLE_TOPIC:
             self.samples.append(_rows(bodies, offset))
@@ -414,7 +417,7 @@ def _event(body: bytes) -> dict[str, Any]:
     return event
 
 
-def _rows(bodies: list[bytes] | NDArray[np.uint8], offset: int) -> NDArray[np.uint8]:
+def _rows(bodies: Bodies, offset: int) -> NDArray[np.uint8]:
     if not isinstance(bodies, list):
         return bodies
     sizes = {len(body) for body in bodies}
