@@ -50,6 +50,8 @@ _BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
 _FOLLOWS: Final = int(Statusword.FOLLOWS_COMMAND)
 _FOLLOWING_ERROR: Final = int(Statusword.FOLLOWING_ERROR)
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
+_FAULT_RESET: Final = int(Controlword.FAULT_RESET)
+_HOMING_START: Final = int(Controlword.HOMING_START)
 _RESUMING: Final = (PowerState.QUICK_STOP_ACTIVE, PowerState.OPERATION_ENABLED)
 _DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
 
@@ -124,7 +126,6 @@ class Axis:
         "_set_point_at_ns",
         "_set_point_timeout_ns",
         "_settings",
-        "_shaft_counts",
         "_slots",
         "_state",
         "_statusword",
@@ -137,6 +138,7 @@ class Axis:
         "is_powered",
         "latch",
         "position_demand_counts",
+        "shaft_counts",
         "source",
     )
 
@@ -155,7 +157,8 @@ class Axis:
         self._slots = slots
         self._emergency = emergency
         self._events = events
-        self.latch: Latch = self._last_tick
+        self.latch: Latch = _no_latch
+        """Set by the drive."""
         self.source = SetPointSource.SDO
         """Set by whoever writes into the dictionary, around the writing."""
 
@@ -191,7 +194,8 @@ class Axis:
         self._demand = Demand()
         self._homing = Homing()
         self._offset = settings.initial_offset_counts
-        self._shaft_counts = 0
+        self.shaft_counts = 0
+        """Resolver counts at the last servo tick."""
         self.position_demand_counts = 0.0
         """Demand at the last servo tick, shaft frame."""
         self._state = PowerState.NOT_READY_TO_SWITCH_ON
@@ -287,7 +291,7 @@ class Axis:
         self._sampled_at_ns = -1
         self.gains = tuple(entry.value for entry in self._gain_entries)
         self._set_period(self._interpolation_value.value, self._interpolation_exponent.value)
-        self._demand.hold(float(self._shaft_counts))
+        self._demand.hold(float(self.shaft_counts))
         self._after_change()
 
     # -- what the machine reads ----------------------------------------------------------------------------------
@@ -328,7 +332,7 @@ class Axis:
 
     def on_tick(self, now_ns: int, shaft_counts: int) -> None:
         """One servo period: bring the demand up to ``now_ns`` and run what depends on time."""
-        self._shaft_counts = shaft_counts
+        self.shaft_counts = shaft_counts
         if self._mode_entry.value != self._mode:
             self._switch_mode(now_ns)
         state = self._state
@@ -336,7 +340,10 @@ class Axis:
             self.position_demand_counts = float(shaft_counts)
             self._demand.hold(float(shaft_counts))
             if state is PowerState.NOT_READY_TO_SWITCH_ON:
-                self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
+                # A fault whose cause has outlived a reset is a fault again.
+                is_healthy = not self._emergency.has_persisting_fault
+                ready = PowerState.SWITCH_ON_DISABLED if is_healthy else PowerState.FAULT_REACTION_ACTIVE
+                self._go_to_state(ready, now_ns)
             elif state is PowerState.FAULT_REACTION_ACTIVE:
                 self._go_to_state(PowerState.FAULT, now_ns)
             return
@@ -409,9 +416,6 @@ class Axis:
         self._is_guarded = self._settings.missing_set_point_limit > 0
         self._set_point_at_ns = now_ns
 
-    def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
-        return self._shaft_counts, 0.0, 0
-
     # -- set-points ----------------------------------------------------------------------------------------------
 
     def _on_target(self, value: int, now_ns: int) -> AbortCode | None:
@@ -481,10 +485,8 @@ class Axis:
     # -- controlword and state -----------------------------------------------------------------------------------
 
     def _on_controlword(self, value: int, now_ns: int) -> AbortCode | None:
-        before = self._controlword.value
-        # Kept before the transitions, for what they read of it.
-        self._controlword.value = value
-        if value & ~before & Controlword.FAULT_RESET and self._state is PowerState.FAULT:
+        before: int = self._controlword.value
+        if value & ~before & _FAULT_RESET and self._state is PowerState.FAULT:
             if not self._emergency.has_persisting_fault:
                 self._emergency.reset_fault(now_ns)
                 self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
@@ -496,7 +498,7 @@ class Axis:
             self._execute(command, now_ns)
         if self._mode is Mode.HOMING and self._state is PowerState.OPERATION_ENABLED:
             status = self._homing.status
-            self._homing.command(bool(value & Controlword.HOMING_START))
+            self._homing.command(bool(value & _HOMING_START))
             if self._homing.status is not status:
                 self._after_change()
         return None
@@ -532,8 +534,8 @@ class Axis:
             was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}
         )
         if not self.is_powered or not was_powered:
-            self._demand.hold(float(self._shaft_counts))
-            self.position_demand_counts = float(self._shaft_counts)
+            self._demand.hold(float(self.shaft_counts))
+            self.position_demand_counts = float(self.shaft_counts)
             self._following_error_since_ns = None
         if before is PowerState.FAULT or state is PowerState.OPERATION_ENABLED:
             self._internal_bits = 0
@@ -628,6 +630,10 @@ class Axis:
                 word |= _FOLLOWS
         self._statusword.value = word
         self._mode_display.value = int(self._mode)
+
+
+def _no_latch(now_ns: int) -> tuple[int, float, int]:
+    return 0, 0.0, 0
 
 
 def _check_homing_method(value: int, now_ns: int) -> AbortCode | None:

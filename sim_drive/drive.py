@@ -33,6 +33,14 @@ _COB_ID_MASK: Final = 0x7FF
 _LAST_COMMUNICATION_INDEX: Final = 0x1FFF
 _LAST_INDEX: Final = 0xFFFF
 
+_COMMUNICATION_ERRORS: Final = (
+    EmergencyCode.HEARTBEAT,
+    EmergencyCode.PDO_TOO_SHORT,
+    EmergencyCode.PDO_TOO_LONG,
+    EmergencyCode.SYNC_LENGTH,
+)
+"""Errors whose cause ends with a reset, because what noticed them starts anew."""
+
 _Handler = Callable[[bytes, int], None]
 
 
@@ -63,8 +71,10 @@ class Drive:
             raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
         self.node_id: Final = node_id
         self.settings: Final = settings
-        self.outbox: Final[list[Frame]] = []
-        self.events: Final[list[Event]] = []
+        self.outbox: list[Frame] = []
+        self.events: list[Event] = []
+        self.latch: Latch = self._last_tick
+        """Where actual values come from; the machine puts the plant's here."""
         self.dictionary: Final = LiveDictionary(dictionary)
         self.subscriptions_changed = True
         """Set whenever ``cob_ids`` gives something else than before; whoever re-reads it sets it back."""
@@ -72,6 +82,7 @@ class Drive:
         self._emergency = EmergencyProducer(node_id, self.dictionary, self.outbox, self.events)
         self.cam_slots: Final = CamSlots(self.dictionary, decode_cam)
         self.axis: Final = Axis(node_id, self.dictionary, settings, self.cam_slots, self._emergency, self.events)
+        self.axis.latch = lambda now_ns: self.latch(now_ns)
         self._sdo = SdoServer(node_id, self.dictionary, self.outbox, round(settings.sdo_timeout_s * _NS_PER_S))
         self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
         self._consumer = HeartbeatConsumer(self.dictionary, self._on_heartbeat_change, self._subscribe)
@@ -166,15 +177,6 @@ class Drive:
                     self._is_wake_stale = True
 
     @property
-    def latch(self) -> Latch:
-        """Where actual values come from: called with an instant, gives shaft counts, counts/s and per mille torque."""
-        return self.axis.latch
-
-    @latch.setter
-    def latch(self, latch: Latch) -> None:
-        self.axis.latch = latch
-
-    @property
     def position_demand_counts(self) -> float:
         """Position demand at the last servo tick, in shaft counts."""
         return self.axis.position_demand_counts
@@ -214,6 +216,9 @@ class Drive:
         """Active mode of operation."""
         return self.axis.mode
 
+    def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
+        return self.axis.shaft_counts, 0.0, 0
+
     def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
         """Make the drive fault: EMCY, fault reaction, fault. ``persists`` until ``end_trip`` is called."""
         self.axis.trip(error_code, error_register_bits, now_ns, persists=persists)
@@ -248,12 +253,15 @@ class Drive:
         last_index = _LAST_INDEX if is_whole_node else _LAST_COMMUNICATION_INDEX
         self.dictionary.restore_defaults(objects.DEVICE_TYPE, last_index)
         self._sdo.reset()
+        for code in _COMMUNICATION_ERRORS:
+            self._emergency.end_cause(code, now_ns)
         if is_whole_node:
             self._emergency.forget()
             self.cam_slots.restore()
             self.axis.restore()
         self._emergency.restore()
         self._handlers = {}
+        self.subscriptions_changed = True
         self._boot_due_ns = now_ns + round(self.settings.boot_up_delay_s * _NS_PER_S)
         if now_ns >= self._boot_due_ns:
             self._boot_up(now_ns)
@@ -283,17 +291,17 @@ class Drive:
     # -- subscriptions -------------------------------------------------------------------------------------------
 
     def _on_pdo_change(self, now_ns: int) -> None:
-        tpdos = [tpdo for tpdo in self._tpdos if tpdo.is_valid]
+        tpdos = [tpdo for tpdo in self._tpdos if tpdo.is_valid and tpdo.length]
         self._sync_tpdos = tuple(tpdo for tpdo in tpdos if not tpdo.is_event_driven)
         self._event_tpdos = tuple(tpdo for tpdo in tpdos if tpdo.is_event_driven)
-        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if rpdo.is_valid and rpdo.is_synchronous)
+        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if rpdo.is_valid and rpdo.length and rpdo.is_synchronous)
         self._is_wake_stale = True
         self._subscribe()
 
     def _subscribe(self) -> None:
         handlers: dict[int, _Handler] = {}
         for rpdo in self._rpdos:
-            if rpdo.is_valid:
+            if rpdo.is_valid and rpdo.length:
                 _add(handlers, rpdo.cob_id, self._rpdo_handler(rpdo))
         for node_id in self._consumer.node_ids:
             _add(handlers, HEARTBEAT_BASE + node_id, self._heartbeat_handler(node_id))

@@ -34,9 +34,9 @@ class EmergencyCode(IntEnum):
     FOLLOWING_ERROR = 0x8611
     SYNC_CONTROLLER = 0x8700
     """Set-points have failed to come for too many SYNC periods."""
-    CAM_NOT_VALID = 0xFF10
+    CAM_NOT_VALID = 0xFF20
     """Camming was asked for without a valid table in the selected slot."""
-    CAM_JUMP = 0xFF11
+    CAM_JUMP = 0xFF21
     """Engaging the cam would make the axis jump."""
 
 
