@@ -1,0 +1,246 @@
+"""Commands that move a machine, real or emulated: run, demo."""
+
+import json
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from gateway.cli.terminal import (
+    EXIT_NO,
+    ChannelOption,
+    ConfigArgument,
+    InterfaceOption,
+    JsonOption,
+    OverwriteOption,
+    PortOption,
+    complain,
+    messages,
+    print_json,
+    require_absent,
+    results,
+)
+
+if TYPE_CHECKING:
+    from config.schema import GatewayConfig
+    from gateway.bus_address import BusAddress
+    from gateway.preparation import PreparedRun
+
+RUN_EPILOG = """Examples:
+
+\b
+  drive-gateway run paper                                  on the configured bus, e.g. against sim-drive
+  drive-gateway run my-machine.yaml -i socketcan -c can0 --cycles 100 --record run.mcap
+  drive-gateway run paper --virtual-time --seed 1 --json   gateway and emulator in virtual time
+
+The first Ctrl-C stops the machine on the cam, a second one with a quick stop.
+"""
+DEMO_EPILOG = """Examples:
+
+\b
+  drive-gateway demo                     vcan0 where it is up, else socketcand on 127.0.0.1
+  drive-gateway demo --channel vcan1     another interface
+  drive-gateway demo --cycles 3 -o /tmp/demo --json
+"""
+VirtualTimeOption = Annotated[
+    bool,
+    typer.Option("--virtual-time", help="Gateway and emulated machine together in virtual time, no bus, no waiting."),
+]
+CyclesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--cycles", "-n", min=1, max=1_000_000, help="Machine cycles at constant speed  [default: from CONFIG]"
+    ),
+]
+
+
+@contextmanager
+def _progress() -> Generator[tuple[Progress, Any]]:
+    """A progress bar on standard error; nothing where that is no terminal."""
+    progress = Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.fields[figure]}"),
+        TimeElapsedColumn(),
+        console=messages(),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
+    with progress:
+        yield progress, progress.add_task("preparing", total=1.0, figure="")
+
+
+def _prepare(config: "GatewayConfig", cycles: int | None) -> "tuple[PreparedRun, str]":
+    from gateway.preparation import prepare
+    from mechanism.cam_file import cam_document
+
+    prepared = prepare(config, cycles)
+    return prepared, json.dumps(cam_document(prepared.cam))
+
+
+def _run_on_bus(
+    prepared: "PreparedRun", cam: str, address: "BusAddress", recording: Path, cycles: int, is_overwriting: bool
+) -> None:
+    from gateway.session import Progress as RunProgress
+    from gateway.session import StopSwitch, run_realtime
+
+    switch = StopSwitch()
+    console = messages()
+
+    def on_event(event: dict[str, Any]) -> None:
+        if event.get("kind") in {"guard", "emergency", "heartbeat_lost"}:
+            console.print(f"  {event['text']}", style="yellow", markup=False)
+        elif event.get("kind") == "realtime" and not event.get("is_on"):
+            console.print(f"  {event['text']}", style="dim", markup=False)
+
+    with _progress() as (progress, task), switch.installed():
+
+        def on_progress(now: RunProgress) -> None:
+            progress.update(
+                task,
+                description=now.step,
+                completed=now.machine_cycles / now.total_machine_cycles,
+                figure=f"{now.machine_cycles:.1f} of {now.total_machine_cycles:.0f} revolutions",
+            )
+
+        run_realtime(
+            prepared,
+            address,
+            recording,
+            cam,
+            switch,
+            machine_cycles=cycles,
+            is_overwriting=is_overwriting,
+            on_progress=on_progress,
+            on_event=on_event,
+        )
+
+
+def _run_virtually(prepared: "PreparedRun", cam: str, recording: Path, seed: int, is_overwriting: bool) -> float:
+    """Carry out the run in virtual time; returns machine seconds per second."""
+    from gateway.core import GatewayCore
+    from gateway.session import StopSwitch
+    from gateway.virtual_run import run_virtual
+    from sim_drive.assembly import build_machine
+
+    machine = build_machine(prepared.config, seed)
+    switch = StopSwitch()
+    started = time.monotonic()
+    reached_s = 0.0
+    with _progress() as (progress, task), switch.installed():
+
+        def on_progress(at_s: float, core: GatewayCore) -> None:
+            nonlocal reached_s
+            reached_s = at_s
+            if switch.request:
+                core.request_stop()
+            speed = at_s / max(time.monotonic() - started, 1e-9)
+            progress.update(
+                task,
+                description="virtual time",
+                completed=at_s / (prepared.plan.duration_s + 0.3),
+                figure=f"{at_s:.1f} s, {speed:.0f} times real time",
+            )
+
+        core = run_virtual(
+            prepared, machine, recording, cam, seed, is_overwriting=is_overwriting, on_progress=on_progress
+        )
+    if core.failure is not None:
+        raise core.failure
+    return reached_s / (time.monotonic() - started)
+
+
+def _show(recording: Path, as_json: bool, report_folder: Path | None) -> None:
+    """Print the figures of a recording, write the report if asked, and end with 1 if the machine was stopped early."""
+    from gateway.analysis import analyse
+    from gateway.guard import StopReason
+    from gateway.recording import read_recording
+    from gateway.report import write_report
+    from gateway.report_text import render_report
+
+    read = read_recording(recording)
+    figures = analyse(read)
+    written = write_report(recording, report_folder) if report_folder is not None else []
+    if as_json:
+        print_json(figures.to_json())
+    else:
+        results().print(render_report(figures))
+    console = messages()
+    for path in written:
+        if path.name == "report.html":
+            console.print(f"report: {path}", soft_wrap=True, markup=False)
+    if read.stopped_by != StopReason.COMPLETED.value:
+        complain([f"the run did not complete, it was stopped by: {read.stopped_by}"], EXIT_NO)
+
+
+def run(
+    config: ConfigArgument,
+    cycles: CyclesOption = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", "-r", help="Recording to write  [default: NAME-DATE-TIME.mcap here]")
+    ] = None,
+    virtual_time: VirtualTimeOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="With --virtual-time: seed of all that is random.")] = 0,
+    interface: InterfaceOption = None,
+    channel: ChannelOption = None,
+    port: PortOption = None,
+    is_overwriting: OverwriteOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Commission the drives, ramp up, run the machine cycles on the cam, ramp down, disable; record and report it."""
+    from config.loading import load_config
+    from gateway.bus_address import resolve_bus
+
+    settings = load_config(config)
+    recording = record or Path(f"{settings.name}-{time.strftime('%Y%m%d-%H%M%S')}.mcap")
+    require_absent(recording, is_overwriting)
+    prepared, cam = _prepare(settings, cycles)
+    if virtual_time:
+        _run_virtually(prepared, cam, recording, seed, is_overwriting)
+    else:
+        count = settings.motion.machine_cycles if cycles is None else cycles
+        address = resolve_bus(settings.bus, interface, channel, port)
+        _run_on_bus(prepared, cam, address, recording, count, is_overwriting)
+    _show(recording, as_json, None)
+
+
+def demo(
+    cycles: CyclesOption = None,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", metavar="DIR", help="Folder for recording, cam and report.")
+    ] = Path("drive-gateway-report"),
+    channel: Annotated[
+        str | None, typer.Option("--channel", "-c", help="SocketCAN interface to use  [default: vcan0 where it is up]")
+    ] = None,
+    virtual_time: VirtualTimeOption = False,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in the emulated machine.")] = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """The whole chain against an emulated machine: compile, commission, run 10 machine cycles, report."""
+    from config.loading import load_config
+    from gateway.session import emulator_process
+    from mechanism.cam_file import write_cam_file
+
+    settings = load_config("paper")
+    console = messages()
+    output.mkdir(parents=True, exist_ok=True)
+    console.print(f"compiling the cam of {settings.description}", markup=False)
+    prepared, cam = _prepare(settings, cycles)
+    write_cam_file(output / "cam.json", prepared.cam)
+    recording = output / "demo.mcap"
+    if virtual_time:
+        _run_virtually(prepared, cam, recording, seed, True)
+    else:
+        console.print("starting the emulated machine (the first start compiles its equations of motion)")
+        interface = "socketcan" if channel is not None else None
+        with emulator_process(settings.path, interface=interface, channel=channel, seed=seed) as address:
+            console.print(f"the emulated machine is on {address}", markup=False)
+            count = settings.motion.machine_cycles if cycles is None else cycles
+            _run_on_bus(prepared, cam, address, recording, count, True)
+    _show(recording, as_json, output)

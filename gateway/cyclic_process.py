@@ -1,0 +1,181 @@
+"""The process that the cyclic loop has for itself: ``python -m gateway.cyclic_process``, its job as JSON on stdin.
+
+It writes samples and events into the ring that the parent has made, takes stop requests from it, and ends with the
+session. It outlives nobody: a parent that dies is a request for a controlled stop.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+from config.loading import parse_config
+from drivers.errors import BusError, DriveError
+from drivers.node import Event
+from drivers.ports import Port
+from drivers.real_time import try_realtime
+from gateway.bus_address import BusAddress
+from gateway.core import GatewayCore
+from gateway.event_text import describe
+from gateway.guard import StopReason
+from gateway.preparation import build_core, plan
+from gateway.ring import RingWriter, RunState, StopRequest
+from mechanism.cam_file import parse_cam_file
+
+MAX_WAIT_S: Final = 0.05
+PR_SET_PDEATHSIG: Final = 1
+
+
+@dataclass(frozen=True, slots=True)
+class CyclicJob:
+    """What the process is to do; travels as JSON."""
+
+    ring: str
+    config_path: str
+    config_text: str
+    cam_text: str
+    machine_cycles: int
+    interface: str
+    channel: str
+    host: str
+    port: int
+    parent_pid: int
+
+    def to_json(self) -> str:
+        """The job as it is sent to the process."""
+        return json.dumps(asdict(self))
+
+
+def run_core(core: GatewayCore, port: Port, clock: Callable[[], int], poll: Callable[[], None]) -> None:
+    """Drive the gateway's core by the clock until it is done; ``poll`` is called once a cycle.
+
+    Unlike the emulator's host, which gives every wake the instant it was due, this one tells the core the time that it
+    really is: the gateway's account is about how late things are.
+
+    Raises BusError when the bus has gone.
+    """
+    loop = core.loop
+    latest_ns = clock()
+    while not core.is_done:
+        received = port.receive()
+        if received is not None:
+            frame, arrival_ns = received
+            due_ns = core.next_wake_ns()
+            if due_ns is not None and due_ns < arrival_ns:
+                latest_ns = max(latest_ns, clock())
+                core.wake(latest_ns)
+            latest_ns = max(latest_ns, arrival_ns)
+            core.receive(frame, latest_ns)
+        else:
+            now_ns = clock()
+            due_ns = core.next_wake_ns()
+            if due_ns is not None and due_ns > now_ns:
+                poll()
+                port.wait(min((due_ns - now_ns) * 1e-9, MAX_WAIT_S))
+                continue
+            latest_ns = max(latest_ns, now_ns)
+            core.wake(latest_ns)
+        frames = core.take_frames()
+        if frames:
+            for frame in frames:
+                port.send(frame)
+            loop.sent(clock())
+
+
+def _stop_with_parent(parent_pid: int) -> None:
+    """Ask the kernel for a SIGTERM when the parent dies, however it dies."""
+    try:
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+    except (OSError, AttributeError):
+        return
+    if os.getppid() != parent_pid:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def run_job(job: CyclicJob, ring: RingWriter) -> int:
+    """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
+    config = parse_config(job.config_text, Path(job.config_path))
+    profile = parse_cam_file(job.cam_text, "cam of the job").cam.profile
+    core = build_core(config, profile, plan(config, job.machine_cycles), ring, time.thread_time_ns)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def on_terminate(_number: int, _frame: FrameType | None) -> None:
+        ring.request_stop(StopRequest.CONTROLLED_STOP)
+
+    signal.signal(signal.SIGTERM, on_terminate)
+    _stop_with_parent(job.parent_pid)
+
+    def on_event(event: Event) -> None:
+        kind, text, data = describe(event)
+        ring.append_event(event.at_ns, kind, text, source="gateway", **data)
+
+    def poll() -> None:
+        for event in core.take_events():
+            on_event(event)
+        ring.beat(time.monotonic_ns())
+        request = ring.stop_request()
+        if request:
+            if request >= StopRequest.QUICK_STOP:
+                core.request_quick_stop()
+            else:
+                core.request_stop()
+
+    address = BusAddress(job.interface, job.channel, job.host, job.port)
+    port: Port | None = None
+    stopped_by = StopReason.BUS_LOST
+    try:
+        port = address.open()
+        for setting in try_realtime():
+            state = "on" if setting.is_on else "off"
+            ring.append_event(
+                time.monotonic_ns(),
+                "realtime",
+                f"{setting.feature.value} {state}: {setting.reason}",
+                is_on=setting.is_on,
+            )
+        ring.set_state(RunState.RUNNING)
+        run_core(core, port, time.monotonic_ns, poll)
+        poll()
+        stopped_by = core.stopped_by
+        failure: Exception | None = core.failure
+    except BusError as error:
+        failure = error
+    finally:
+        if port is not None:
+            port.close()
+    if failure is not None:
+        for sentence in str(failure).splitlines():
+            ring.append_event(time.monotonic_ns(), "failure", sentence)
+    ring.append_event(time.monotonic_ns(), "end", f"stopped by {stopped_by.value}", stopped_by=stopped_by.value)
+    is_failed = failure is not None
+    ring.set_state(RunState.FAILED if is_failed else RunState.FINISHED, int(is_failed))
+    return int(is_failed)
+
+
+def main() -> int:
+    """Read the job from stdin and carry it out."""
+    job = CyclicJob(**json.loads(sys.stdin.read()))
+    ring = RingWriter.take_over(Path(job.ring))
+    try:
+        return run_job(job, ring)
+    except DriveError as error:
+        ring.append_event(time.monotonic_ns(), "failure", str(error))
+        ring.set_state(RunState.FAILED, 1)
+        return 1
+    except BaseException as error:
+        ring.append_event(time.monotonic_ns(), "failure", f"internal error: {type(error).__name__}: {error}")
+        ring.set_state(RunState.FAILED, 1)
+        raise
+    finally:
+        ring.close(unlink=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""Events of the cores in words and as data, for the event log of a run."""
+
+from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
+from drivers.node import Event
+from gateway.core import StepReached
+from gateway.guard import GuardTripped
+
+EventData = dict[str, str | int | float | bool | None]
+
+
+def describe(event: Event) -> tuple[str, str, EventData]:
+    """Kind, sentence and data of an event; an event that is not the gateway's is told by its name."""
+    match event:
+        case StepReached(_, step):
+            return "step", step, {}
+        case GuardTripped(_, condition, axis, value, limit, reaction):
+            where = f" on axis {axis}" if axis else ""
+            name, answer = condition.value.replace("_", " "), reaction.value.replace("_", " ")
+            text = f"{name}{where}: {value} (limit {limit}), {answer}"
+            return "guard", text, {"condition": condition.value, "axis": axis, "value": value, "limit": limit}
+        case EmergencyReceived(_, node_id, code, register, vendor):
+            text = f"node {node_id} EMCY {code:04X}h, error register {register:02X}h"
+            return "emergency", text, {"node_id": node_id, "code": code, "vendor": vendor.hex()}
+        case HeartbeatLost(_, node_id, timeout_s):
+            return "heartbeat_lost", f"node {node_id}: no heartbeat for {timeout_s:g} s", {"node_id": node_id}
+        case BootUpReceived(_, node_id):
+            return "boot_up", f"node {node_id} has booted up", {"node_id": node_id}
+        case NodeStateChanged(_, node_id, state):
+            text = f"node {node_id} is {state.name.lower().replace('_', '-')}"
+            return "nmt_state", text, {"node_id": node_id, "state": state.name.lower()}
+        case _:
+            return "event", type(event).__name__, {}

@@ -1,0 +1,207 @@
+"""From a configuration to everything a run needs, with every limit proved before any bus is opened."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from config.conversion import desired_curve, five_bar, home_angles
+from config.schema import AxisSection, GatewayConfig
+from drivers.master import Master
+from gateway.commissioning import NetworkSettings, NodeSettings
+from gateway.core import AxisSetup, GatewayCore
+from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
+from gateway.demand import CamDemand
+from gateway.guard import Guard
+from gateway.run_constants import AxisConstants, MechanismConstants, RunConstants
+from gateway.units import AxisUnits
+from mechanism.cam import CamLimits, CompiledCam, compile_cam
+from mechanism.cam_profile import CamProfile
+from mechanism.errors import CamLimitError, MechanismError
+from mechanism.motion import MasterPlan, plan_run
+
+RAMP_GRID: Final = 4096
+NS_PER_US: Final = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRun:
+    """A run that may be carried out: compiled, checked and planned.
+
+    ``violations`` is empty unless the run was prepared for a check, which reports instead of refusing.
+    """
+
+    config: GatewayConfig
+    cam: CompiledCam
+    plan: MasterPlan
+    violations: tuple[MechanismError, ...]
+
+
+def compile_config(config: GatewayConfig) -> CompiledCam:
+    """Compile the configuration's curve; limits that are broken are in its ``violations``.
+
+    Raises mechanism.errors.MechanismError for a curve that cannot be read.
+    """
+    slave = config.ordered_axes[1]
+    position = slave.limits.position_deg
+    limits = CamLimits(
+        velocity_rad_per_s=slave.limits.velocity_rad_per_s,
+        acceleration_rad_per_s2=slave.limits.acceleration_rad_per_s2,
+        jerk_rad_per_s3=slave.limits.jerk_rad_per_s3,
+        position_minimum_rad=None if position is None else math.radians(position[0]),
+        position_maximum_rad=None if position is None else math.radians(position[1]),
+        structural_error_m=config.motion.structural_error_limit_mm / 1e3,
+        minimum_transmission_sine=config.machine.minimum_transmission_sine,
+    )
+    return compile_cam(
+        desired_curve(config),
+        five_bar(config),
+        limits,
+        config.speed_rad_per_s,
+        counts_per_revolution=slave.counts_per_revolution,
+        cycle_s=config.cycle_s,
+        knots=config.motion.cam_points,
+        image_points=config.motion.cam_points,
+    )
+
+
+def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict: bool = True) -> PreparedRun:
+    """Compile, check and plan; ``machine_cycles`` overrides the configuration's.
+
+    Raises the first violation as a mechanism.errors.MechanismError if ``is_strict``.
+    """
+    cam = compile_config(config)
+    violations = (*cam.violations, *_ramp_violations(config, cam.profile))
+    if is_strict and violations:
+        raise violations[0]
+    return PreparedRun(config, cam, plan(config, machine_cycles), violations)
+
+
+def plan(config: GatewayConfig, machine_cycles: int | None = None) -> MasterPlan:
+    """The master's plan: from home up to speed, the machine cycles, and down again to where it began."""
+    motion = config.motion
+    return plan_run(
+        home_angles(config)[0],
+        config.speed_rad_per_s,
+        motion.machine_cycles if machine_cycles is None else machine_cycles,
+        motion.ramp_acceleration_rad_per_s2,
+        motion.ramp_jerk_rad_per_s3,
+    )
+
+
+def _ramp_violations(config: GatewayConfig, profile: CamProfile) -> list[MechanismError]:
+    """What the servo axis would exceed if the master ramped, or stopped, at any position of the cycle."""
+    slave = config.ordered_axes[1]
+    theta2 = np.linspace(0.0, math.tau, RAMP_GRID, endpoint=False)
+    motion = profile.at_many(theta2)
+    ramp = config.motion.ramp_acceleration_rad_per_s2
+    worst = np.abs(motion[:, 2]) * config.speed_rad_per_s**2 + np.abs(motion[:, 1]) * ramp
+    at = int(np.argmax(worst))
+    limit = slave.limits.acceleration_rad_per_s2
+    if worst[at] <= limit:
+        return []
+    what = f"acceleration while the master ramps at {ramp:g} rad/s^2"
+    return [CamLimitError(what, float(worst[at]), limit, "rad/s^2", float(theta2[at]))]
+
+
+def axis_units(axis: AxisSection) -> AxisUnits:
+    """The converter of one axis."""
+    return AxisUnits(axis.counts_per_revolution, math.radians(axis.home_angle_deg), axis.rated_torque_Nm)
+
+
+def node_settings(config: GatewayConfig) -> list[NodeSettings]:
+    """What commissioning must know of each drive, master first."""
+    return [
+        NodeSettings(
+            name=name,
+            node_id=axis.node_id,
+            identity=(
+                axis.identity.vendor_id,
+                axis.identity.product_code,
+                axis.identity.revision_number,
+                axis.identity.serial_number,
+            ),
+            following_error_window=axis.limits.following_error_counts,
+            rated_torque_mNm=round(axis.rated_torque_Nm * 1000.0),
+            counts_per_revolution=axis.counts_per_revolution,
+        )
+        for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
+    ]
+
+
+def network_settings(config: GatewayConfig) -> NetworkSettings:
+    """What all drives have in common."""
+    interpolation_time = config.bus.interpolation_time()
+    if interpolation_time is None:
+        raise ValueError("the configuration's own check lets no such cycle pass")
+    return NetworkSettings(
+        gateway_node_id=config.bus.gateway_node_id,
+        heartbeat_ms=config.bus.heartbeat_ms,
+        heartbeat_timeout_ms=config.bus.heartbeat_timeout_ms,
+        boot_up_timeout_s=config.bus.boot_up_timeout_s,
+        cycle_us=config.bus.cycle_us,
+        interpolation_time=interpolation_time,
+    )
+
+
+def build_master(config: GatewayConfig) -> Master:
+    """The CANopen master for the configuration's nodes."""
+    node_ids = [axis.node_id for axis in config.ordered_axes]
+    return Master(node_ids, config.bus.gateway_node_id, config.bus.heartbeat_ms * 1_000_000)
+
+
+def build_core(
+    config: GatewayConfig,
+    profile: CamProfile,
+    run_plan: MasterPlan,
+    sink: SampleSink,
+    cpu_clock: Callable[[], int] | None = None,
+) -> GatewayCore:
+    """Put the gateway's parts together; see ``gateway.core``."""
+    channels = [
+        AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.following_error_counts)
+        for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
+    ]
+    setups = [
+        AxisSetup(node, channel, axis.homing_method)
+        for node, channel, axis in zip(node_settings(config), channels, config.ordered_axes, strict=True)
+    ]
+    guard = Guard(config.guard, config.axis_names)
+    loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock)
+    demand = CamDemand(
+        profile,
+        (channels[0].units, channels[1].units),
+        config.cycle_s,
+        config.motion.ramp_acceleration_rad_per_s2,
+        config.motion.ramp_jerk_rad_per_s3,
+    )
+    return GatewayCore(setups, network_settings(config), build_master(config), loop, demand, run_plan, guard)
+
+
+def run_constants(config: GatewayConfig, cam: CompiledCam) -> RunConstants:
+    """What a reader of the run's samples must know about the machine."""
+    bar = cam.five_bar
+    return RunConstants(
+        config_name=config.name,
+        period_s=config.cycle_s,
+        axes=tuple(
+            AxisConstants(
+                name=name,
+                counts_per_revolution=axis.counts_per_revolution,
+                rated_torque_nm=axis.rated_torque_Nm,
+                zero_rad=math.radians(axis.home_angle_deg),
+            )
+            for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
+        ),
+        mechanism=MechanismConstants(
+            p_m=bar.p,
+            q_m=bar.q,
+            r_m=bar.r,
+            s_m=bar.s,
+            cv_pivot_m=bar.cv_pivot,
+            servo_pivot_m=bar.servo_pivot,
+            closure=int(cam.closure),
+        ),
+    )

@@ -1,0 +1,254 @@
+"""A run in real time, as its parent sees it: the ring, the cyclic process, the recorder, and what comes of them."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+from gateway.bus_address import BusAddress
+from gateway.cyclic_process import CyclicJob
+from gateway.errors import GatewayError
+from gateway.preparation import PreparedRun, run_constants
+from gateway.ring import RingReader, RingWriter, RunState, StopRequest
+
+POLL_S: Final = 0.1
+RECORDER_TIMEOUT_S: Final = 30.0
+PROCESS_TIMEOUT_S: Final = 15.0
+"""How long the cyclic process may take to end after a stop, before it is terminated."""
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What the parent shows while a run goes on."""
+
+    at_s: float
+    """Time since the processes were started."""
+    step: str
+    """The session's last step, in words."""
+    machine_cycles: float
+    """Whole and broken machine cycles that the master has turned so far."""
+    total_machine_cycles: float
+    """Machine cycles of the whole plan, ramps included."""
+
+
+class StopSwitch:
+    """SIGINT and SIGTERM as stop requests: the first asks for a controlled stop, the second for a quick stop."""
+
+    def __init__(self) -> None:
+        self.request = StopRequest.NONE
+
+    def press(self, _number: int = 0, _frame: FrameType | None = None) -> None:
+        """Ask for a stop, or for a stronger one."""
+        self.request = StopRequest.CONTROLLED_STOP if self.request is StopRequest.NONE else StopRequest.QUICK_STOP
+
+    @contextmanager
+    def installed(self) -> Generator[None]:
+        """While this lasts the signals press the switch."""
+        before = {number: signal.signal(number, self.press) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def _python_environment() -> dict[str, str]:
+    """The environment of the children: they import the same rooms as this process, wherever it was started."""
+    root = str(Path(__file__).resolve().parent.parent)
+    known = os.environ.get("PYTHONPATH", "")
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in (root, known) if part)}
+
+
+def run_realtime(
+    prepared: PreparedRun,
+    address: BusAddress,
+    recording: Path,
+    cam_text: str,
+    switch: StopSwitch,
+    *,
+    machine_cycles: int,
+    is_overwriting: bool = False,
+    on_progress: Callable[[Progress], None] | None = None,
+    on_event: Callable[[dict[str, Any]], None] | None = None,
+) -> None:
+    """Carry out a prepared run on a bus and record it.
+
+    Raises GatewayError with what went wrong: a bus that is not there, drives that are not what they should be, a
+    process that died. A stop that the guard called for is no error here; the recording says ``stopped_by``.
+    """
+    config = prepared.config
+    constants = run_constants(config, prepared.cam)
+    failures: list[str] = []
+    start_ns = time.monotonic_ns()
+    start_wall_ns = time.time_ns()
+    with RingWriter.create(config.name, constants) as ring, tempfile.TemporaryDirectory() as folder:
+        config_file, cam_file = Path(folder, "config.yaml"), Path(folder, "cam.json")
+        config_file.write_text(config.text, encoding="utf-8")
+        cam_file.write_text(cam_text, encoding="utf-8")
+        command = [sys.executable, "-m", "gateway.recorder", str(ring.path), str(recording)]
+        command += ["--config", str(config_file), "--cam", str(cam_file)]
+        command += ["--start-ns", str(start_ns), "--start-wall-ns", str(start_wall_ns)]
+        command += ["--overwrite"] if is_overwriting else []
+        environment = _python_environment()
+        recorder = subprocess.Popen(  # noqa: S603 -- our own module
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment,
+            text=True,
+        )
+        job = CyclicJob(
+            ring=str(ring.path),
+            config_path=str(config.path),
+            config_text=config.text,
+            cam_text=cam_text,
+            machine_cycles=machine_cycles,
+            interface=address.interface,
+            channel=address.channel,
+            host=address.host,
+            port=address.port,
+            parent_pid=os.getpid(),
+        )
+        loop = subprocess.Popen(
+            [sys.executable, "-m", "gateway.cyclic_process"],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            env=environment,
+            text=True,
+        )
+        try:
+            if loop.stdin is not None:
+                loop.stdin.write(job.to_json())
+                loop.stdin.close()
+            with RingReader(ring.path) as reader:
+                _follow(loop, recorder, reader, prepared, start_ns, switch, failures, on_progress, on_event)
+        finally:
+            loop_errors = _end(loop, PROCESS_TIMEOUT_S)
+        if loop.returncode not in (0, 1) or (loop.returncode == 1 and not failures):
+            last = loop_errors.strip().splitlines()[-1:] or ["nothing on stderr"]
+            failures.append(f"the cyclic process ended with status {loop.returncode} ({last[0]})")
+            # Nobody else will say so to the recorder, which otherwise waits for the writer that this process is.
+            ring.set_state(RunState.FAILED, 1)
+        recorder_errors = _end(recorder, RECORDER_TIMEOUT_S)
+        if recorder.returncode != 0:
+            last = recorder_errors.strip().splitlines()[-1:] or ["nothing on stderr"]
+            failures.append(last[0] if recorder.returncode == 2 else f"the recorder died: {last[0]}")
+    if failures:
+        raise GatewayError("\n".join(failures))
+
+
+def _follow(
+    loop: "subprocess.Popen[str]",
+    recorder: "subprocess.Popen[str]",
+    reader: RingReader,
+    prepared: PreparedRun,
+    start_ns: int,
+    switch: StopSwitch,
+    failures: list[str],
+    on_progress: Callable[[Progress], None] | None,
+    on_event: Callable[[dict[str, Any]], None] | None,
+) -> None:
+    """Watch the run until the cyclic process ends; hand on stops, events and progress."""
+    step = "starting"
+    turns = 0.0
+    total = (prepared.plan.end_position - prepared.plan.at(0.0)[0]) / 6.283185307179586
+    first: float | None = None
+    is_recorder_lost = False
+    while True:
+        with suppress(subprocess.TimeoutExpired):
+            loop.wait(POLL_S)
+        is_over = loop.poll() is not None
+        if switch.request is not StopRequest.NONE:
+            reader.request_stop(switch.request)
+        if recorder.poll() is not None and not is_over and not is_recorder_lost:
+            is_recorder_lost = True
+            # A machine that nobody records is brought to rest, on the cam; the cycle itself never waits for a recorder.
+            reader.request_stop(StopRequest.CONTROLLED_STOP)
+        samples, _ = reader.read_new()
+        if len(samples):
+            position = float(samples["master_position"][-1])
+            first = position if first is None else first
+            turns = abs(position - first) / 6.283185307179586
+        for event in reader.read_new_events()[0]:
+            kind, text = str(event.data.get("kind")), str(event.data.get("text"))
+            if kind == "step":
+                step = text
+            elif kind == "failure":
+                failures.append(text)
+            if on_event is not None:
+                on_event(dict(event.data))
+        if on_progress is not None:
+            on_progress(Progress((time.monotonic_ns() - start_ns) * 1e-9, step, turns, total))
+        if is_over:
+            return
+
+
+def _end(process: "subprocess.Popen[str]", timeout_s: float) -> str:
+    """Wait for a child, end it if it does not; returns what it wrote to stderr."""
+    try:
+        _, errors = process.communicate(timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        process.terminate()
+        try:
+            _, errors = process.communicate(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            _, errors = process.communicate()
+    return errors or ""
+
+
+@contextmanager
+def emulator_process(
+    config_path: Path,
+    *,
+    interface: str | None,
+    channel: str | None,
+    timeout_s: float = 90.0,
+    on_wait: Callable[[float], None] | None = None,
+    seed: int = 0,
+) -> Generator[BusAddress]:
+    """Start ``sim-drive`` as a process of its own, wait until it serves its bus, and end it afterwards.
+
+    Raises GatewayError if it does not come up; what it says on stderr is in the error.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        ready = Path(folder, "ready.json")
+        command = [sys.executable, "-m", "sim_drive.cli", str(config_path), "--port", "0"]
+        command += ["--ready-file", str(ready), "--seed", str(seed)]
+        command += ["--interface", interface] if interface else []
+        command += ["--channel", channel] if channel else []
+        process = subprocess.Popen(  # noqa: S603 -- our own module
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            env=_python_environment(),
+            text=True,
+            start_new_session=True,
+        )
+        try:
+            started = time.monotonic()
+            while not ready.exists() or not ready.read_text().endswith("\n"):
+                waited = time.monotonic() - started
+                if process.poll() is not None or waited > timeout_s:
+                    errors = _end(process, 0.1).strip()
+                    raise GatewayError(errors.splitlines()[-1] if errors else "the emulator did not come up")
+                if on_wait is not None:
+                    on_wait(waited)
+                time.sleep(0.05)
+            place = json.loads(ready.read_text())
+            yield BusAddress(place["interface"], place["channel"], place.get("host") or "", int(place.get("port") or 0))
+        finally:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+            _end(process, 10.0)

@@ -1,0 +1,74 @@
+"""Builds the emulated machine that a configuration describes."""
+
+from typing import Final
+
+from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
+from config.schema import AxisSection, GatewayConfig
+from drivers.eds import load_eds
+from mechanism.cam_image import decode_cam_image
+from sim_drive.drive import Drive
+from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.settings import DriveIdentity, DriveSettings
+
+SINGULAR_SHARE: Final = 0.5
+"""The plant tears at this share of the transmission sine that the configuration keeps as its distance."""
+
+
+def build_machine(config: GatewayConfig, seed: int = 0, start_ns: int = 0, record_ticks: int = 0) -> EmulatedMachine:
+    """The configuration's drives and coupled plant, standing at the home position with the brakes engaged.
+
+    ``start_ns``: the host's time at which it is put on the bus; ``seed`` decides the resolvers' noise;
+    ``record_ticks``: see EmulatedMachine. Raises drivers.errors.EdsError or mechanism.errors.MechanismError.
+    """
+    axes = config.ordered_axes
+    eds = config.relative(config.emulator.eds)
+    drives = [
+        Drive(axis.node_id, load_eds(eds, axis.node_id), drive_settings(axis, config), decode_cam_image)
+        for axis in axes
+    ]
+    parameters = PlantParameters(
+        dynamics=dynamics_parameters(config),
+        closure=closure_at_home(config, desired_curve(config)),
+        axes=(_driveline(axes[0]), _driveline(axes[1])),
+        singular_sine=SINGULAR_SHARE * config.machine.minimum_transmission_sine,
+        substeps=config.emulator.sub_steps,
+    )
+    theta2, theta5 = home_angles(config)
+    plant = CoupledPlant(parameters, theta2, theta5)
+    return EmulatedMachine(drives, plant, [_machine_axis(axis) for axis in axes], start_ns, seed, record_ticks)
+
+
+def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
+    """What the emulated drive of an axis is; an identity that the configuration leaves open is the emulator's own."""
+    given, own, gains = axis.identity, DriveIdentity(), axis.emulation.gains
+    return DriveSettings(
+        identity=DriveIdentity(
+            own.vendor_id if given.vendor_id is None else given.vendor_id,
+            own.product_code if given.product_code is None else given.product_code,
+            own.revision_number if given.revision_number is None else given.revision_number,
+            axis.node_id if given.serial_number is None else given.serial_number,
+        ),
+        counts_per_revolution=axis.counts_per_revolution,
+        rated_torque_Nm=axis.rated_torque_Nm,
+        gains=(gains.K_P, gains.K_I, gains.K_D, gains.K_V, gains.K_F),
+        missing_set_point_limit=config.emulator.missing_sync_limit,
+    )
+
+
+def _driveline(axis: AxisSection) -> AxisDriveline:
+    emulation = axis.emulation
+    return AxisDriveline(
+        torque_limit_Nm=emulation.torque_limit_Nm,
+        torque_time_constant_s=emulation.torque_time_constant_s,
+        brake_torque_Nm=emulation.brake_torque_Nm,
+    )
+
+
+def _machine_axis(axis: AxisSection) -> MachineAxis:
+    return MachineAxis(
+        counts_per_revolution=axis.counts_per_revolution,
+        torque_per_volt=axis.emulation.torque_per_volt_Nm,
+        rated_torque_Nm=axis.rated_torque_Nm,
+        resolver_noise_counts=axis.emulation.resolver_noise_counts,
+    )
