@@ -115,11 +115,11 @@ class LimitsSection(Model):
 class GainsSection(Model):
     """Gains of the paper's eq. (5), integers over 256 (eq. 6)."""
 
-    K_P: Annotated[int, Field(ge=0, le=65535)]
-    K_I: Annotated[int, Field(ge=0, le=65535)] = 0
-    K_D: Annotated[int, Field(ge=0, le=65535)] = 0
-    K_V: Annotated[int, Field(ge=0, le=65535)] = 0
-    K_F: Annotated[int, Field(ge=0, le=65535)] = 0
+    K_P: Annotated[int, Field(ge=0, le=1_000_000)]
+    K_I: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    K_D: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    K_V: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    K_F: Annotated[int, Field(ge=0, le=1_000_000)] = 0
 
 
 class EmulatedDriveSection(Model):

@@ -130,6 +130,8 @@ def run_realtime(
             if loop.stdin is not None:
                 loop.stdin.write(job.to_json())
                 loop.stdin.close()
+                # Else communicate() would flush it once more.
+                loop.stdin = None
             with RingReader(ring.path) as reader:
                 _follow(loop, recorder, reader, prepared, start_ns, switch, failures, on_progress, on_event)
         finally:
@@ -223,8 +225,8 @@ def emulator_process(
     """
     with tempfile.TemporaryDirectory() as folder:
         ready = Path(folder, "ready.json")
-        command = [sys.executable, "-m", "sim_drive.cli", str(config_path), "--port", "0"]
-        command += ["--ready-file", str(ready), "--seed", str(seed)]
+        command = [sys.executable, "-m", "sim_drive", str(config_path), "--port", "0"]
+        command += ["--ready-file", str(ready), "--seed", str(seed), "--realtime"]
         command += ["--interface", interface] if interface else []
         command += ["--channel", channel] if channel else []
         process = subprocess.Popen(  # noqa: S603 -- our own module

@@ -1,0 +1,5 @@
+"""``python -m sim_drive``."""
+
+from sim_drive.cli import main
+
+main()
