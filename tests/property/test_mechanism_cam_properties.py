@@ -1,6 +1,6 @@
 """Cam profiles, images and plans over random data."""
 
-from math import tau
+from math import comb, tau
 
 import numpy as np
 import pytest
@@ -95,9 +95,7 @@ def test_a_profile_is_periodic_and_four_times_continuous(
     c = profile.coefficients
     following = np.roll(c, -1, axis=0).copy()
     following[-1, 0] += tau * net_turns
-    binomial = np.array(
-        [[1, 1, 1, 1, 1, 1], [0, 1, 2, 3, 4, 5], [0, 0, 1, 3, 6, 10], [0, 0, 0, 1, 4, 10], [0, 0, 0, 0, 1, 5]]
-    )
+    binomial = np.array([[comb(power, order) for power in range(6)] for order in range(5)])
     assert np.abs(c @ binomial.T - following[:, :5]).max() < 1e-10 * size
 
 
