@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 
@@ -20,6 +20,11 @@ from drivers.errors import BusError, DriveError
 from drivers.node_runner import RunStatistics
 from drivers.ports import interface_is_up, open_port
 from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
+from mechanism.errors import MechanismError
+from sim_drive.socketcand_server import SocketcandServer
+
+if TYPE_CHECKING:
+    from sim_drive.machine import EmulatedMachine
 
 _EXIT_BUS: Final = 1
 _EXIT_USE: Final = 2
@@ -116,19 +121,16 @@ def sim_drive(
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="sim-drive: %(message)s")
     stop = _stop_on_signals()
     settings = load_config(config)
-    # Here, not above: the maths behind it takes a second to import, which --help and a bad CONFIG need not wait for.
-    from sim_drive.assembly import build_machine
-
-    machine = build_machine(settings, seed)
     place = _place(settings.bus, interface, channel, host, port)
     announcement = _Announcement(as_json, ready_file, ready_fd)
-    if realtime:
-        for setting in try_realtime():
-            state = "on" if setting.is_on else "off"
-            print(f"sim-drive: {setting.feature.value}: {state} ({setting.reason})", file=sys.stderr)
-    else:
-        tighten_timers()
-        freeze_garbage()
+
+    def build() -> "EmulatedMachine":
+        # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
+        from sim_drive.assembly import build_machine
+
+        machine = build_machine(settings, seed)
+        _prepare_process(realtime)
+        return machine
 
     def until() -> Callable[[], bool]:
         if duration is None:
@@ -139,14 +141,14 @@ def sim_drive(
     if place.host is None or place.port is None:
         bus = open_port(place.interface, place.channel)
         try:
+            machine = build()
             announcement.make(settings.name, place)
             statistics = run_node(machine, bus, until())
         finally:
             bus.close()
     else:
-        from sim_drive.socketcand_server import SocketcandServer
-
-        with SocketcandServer(machine, place.host, place.port, place.channel, allow_remote=allow_remote) as server:
+        server = SocketcandServer(build(), place.host, place.port, place.channel, allow_remote=allow_remote)
+        with server:
             real_host, real_port = server.address
             announcement.make(settings.name, _Place(place.interface, place.channel, real_host, real_port))
             statistics = server.run(until())
@@ -159,7 +161,7 @@ def main() -> NoReturn:
         app(prog_name="sim-drive")
     except ConfigError as error:
         status, sentences = _EXIT_USE, error.problems
-    except DriveError as error:
+    except (DriveError, MechanismError) as error:
         status, sentences = (_EXIT_BUS if isinstance(error, BusError) else _EXIT_USE), [str(error)]
     except OSError as error:
         status, sentences = _EXIT_USE, [f"{error.filename or 'input/output'}: {error.strerror or error}"]
@@ -178,6 +180,16 @@ def _place(bus: BusSection, interface: str | None, channel: str | None, host: st
     if chosen_interface != "socketcand":
         return _Place(chosen_interface, chosen_channel)
     return _Place(chosen_interface, chosen_channel, host or bus.host, bus.port if port is None else port)
+
+
+def _prepare_process(realtime: bool) -> None:
+    if not realtime:
+        tighten_timers()
+        freeze_garbage()
+        return
+    for setting in try_realtime():
+        state = "on" if setting.is_on else "off"
+        print(f"sim-drive: {setting.feature.value}: {state} ({setting.reason})", file=sys.stderr)
 
 
 def _stop_on_signals() -> Callable[[], bool]:
