@@ -19,7 +19,7 @@ from sim_drive.socketcand_session import SessionState, SocketcandFrame, Socketca
 MAX_CLIENTS: Final = 16
 MAX_BACKLOG_BYTES: Final = 256 * 1024
 """A client that leaves more than this unread is dropped, rather than holding up the bus."""
-GREETING_HOLD_NS: Final = 100_000_000
+GREETING_HOLD_NS: Final = 300_000_000
 """How long frames are kept from a client that has just been told ``< ok >``, unless it says something sooner.
 
 python-can's client takes all that it reads for the answer: a frame that arrives behind it makes the greeting fail.
