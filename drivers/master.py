@@ -153,8 +153,8 @@ class Master:
         self.now_ns = now_ns
         if self._heartbeat_period_ns and now_ns >= self._heartbeat_due_ns:
             self.outbox.append(self._heartbeat)
-            self._heartbeat_due_ns = max(self._heartbeat_due_ns, now_ns - self._heartbeat_period_ns)
-            self._heartbeat_due_ns += self._heartbeat_period_ns
+            periods = (now_ns - self._heartbeat_due_ns) // self._heartbeat_period_ns + 1
+            self._heartbeat_due_ns += periods * self._heartbeat_period_ns
         for node in self.nodes.values():
             if (
                 node.heartbeat_timeout_ns

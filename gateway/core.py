@@ -24,7 +24,11 @@ from mechanism.motion import MasterPlan
 
 NS_PER_S: Final = 1_000_000_000
 SETTLE_S: Final = 0.1
-"""Standstill on the cam before the drives are disabled."""
+"""Standstill under guard before the motion begins, and after it before the drives are disabled."""
+WATCH_AFTER_DISABLING_S: Final = 0.02
+"""For so long the cycle goes on after the drives are disabled, to see and record that they stay where they are."""
+START_CYCLES: Final = 4
+"""Cycles after which a drive shows what it makes of a controlword: sent, applied at SYNC, sampled, returned."""
 ENABLE_TIMEOUT_S: Final = 2.0
 HOMING_TIMEOUT_S: Final = 5.0
 MODE_TIMEOUT_S: Final = 1.0
@@ -249,6 +253,8 @@ class GatewayCore:
         yield from self._set_mode(axis, ModeOfOperation.HOMING)
         yield from self._enable(axis)
         channel.controlword = cia402.COMMAND_ENABLE_OPERATION | int(cia402.Controlword.MODE_SPECIFIC_4)
+        # An earlier homing may still be shown as attained until the drive has seen the new start.
+        yield from self.master.pause(START_CYCLES * self.loop.period_ns / NS_PER_S)
         done = Statusword.TARGET_REACHED | Statusword.MODE_SPECIFIC_12
         attained = yield from self.master.wait_for(
             lambda: channel.statusword & done == done or bool(channel.statusword & Statusword.MODE_SPECIFIC_13),
@@ -278,7 +284,7 @@ class GatewayCore:
         channel = axis.channel
         if state_of(channel.statusword) in {State.FAULT, State.FAULT_REACTION_ACTIVE}:
             channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
-            yield from self.master.pause(4 * self.loop.period_ns / NS_PER_S)
+            yield from self.master.pause(START_CYCLES * self.loop.period_ns / NS_PER_S)
             channel.controlword = cia402.COMMAND_FAULT_RESET
             yield from self.master.wait_for(lambda: state_of(channel.statusword) is not State.FAULT, DISABLE_TIMEOUT_S)
             channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
@@ -327,11 +333,13 @@ class GatewayCore:
         self.loop.phase = Phase.STANDSTILL
 
     def _move(self) -> Procedure[None]:
+        # Standing under guard first: a drive that cannot hold still must not be asked to move.
+        yield from self.master.pause(SETTLE_S)
         self._step("moving")
         self._demand.begin(self._plan)
         self.loop.follow(self._demand)
         loop, demand, guard = self.loop, self._demand, self._guard
-        while not demand.is_finished and loop.phase is not Phase.QUICK_STOP:
+        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
             if self._is_stop_requested:
                 loop.controlled_stop()
             yield self.master.now_ns + NS_PER_S
@@ -370,6 +378,7 @@ class GatewayCore:
             if not disabled and self.failure is None:
                 states = ", ".join(f"{a.node.name} '{state_of(a.channel.statusword).value}'" for a in self._axes)
                 self.failure = GatewayError(f"the drives did not confirm that they are disabled: {states}")
+            yield from self.master.pause(WATCH_AFTER_DISABLING_S)
             loop.stop()
         for node in self._nodes:
             self.master.watch_heartbeat(node.node_id, 0.0)
