@@ -94,6 +94,8 @@ class AxisFigures:
     position_actual_counts: Extremes
     displacement_deg: float | None
     """Span of the actual position."""
+    demand_displacement_deg: float | None
+    """Span of the demand."""
     velocity_actual_counts_per_s: Extremes
     """One-sample differences of the actual position, the paper's way; a multiple of one count a cycle."""
     velocity_smoothed_counts_per_s: Extremes
@@ -133,7 +135,7 @@ class CycleFigures:
     rpdo_lead_us: Extremes
     """Last RPDO before the next SYNC was due."""
     loop_cpu_us_per_cycle: float | None
-    """Mean."""
+    """Mean; None where nobody measured it, as in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,13 +314,15 @@ def _axis_figures(data: RunData, axis: int, mask: BoolArray) -> AxisFigures:
     position = data.samples["position_actual"][valid, axis].astype(np.float64)
     torque = data.torque_nm[valid, axis]
     constants = data.constants.axes[axis]
-    displacement = float(np.ptp(position)) * 360.0 / constants.counts_per_revolution if len(position) else None
+    demand = data.samples["position_demand"][mask, axis].astype(np.float64)
+    degrees = 360.0 / constants.counts_per_revolution
     return AxisFigures(
         samples=len(position),
         following_error_counts=_error_figures(data.error_counts[valid, axis], data.master_deg[valid]),
         following_error_deg=_error_figures(data.error_deg[valid, axis], data.master_deg[valid]),
         position_actual_counts=_extremes(position),
-        displacement_deg=displacement,
+        displacement_deg=float(np.ptp(position)) * degrees if len(position) else None,
+        demand_displacement_deg=float(np.ptp(demand)) * degrees if len(demand) else None,
         velocity_actual_counts_per_s=_extremes(_velocity(data, axis, valid, 1)[1]),
         velocity_smoothed_counts_per_s=_extremes(_velocity(data, axis, valid, SMOOTHING_CYCLES)[1]),
         demand_velocity_rad_per_s=_extremes(data.samples["demand_velocity"][mask, axis]),
@@ -367,7 +371,7 @@ def cycle_figures(data: RunData) -> CycleFigures:
         wake_lateness_us=_distribution(samples["wake_lateness_ns"].astype(np.float64)),
         tpdo_arrival_us=_distribution(samples["tpdo_arrival_ns"][(flags & MISSED_TPDO_MASK) == 0].astype(np.float64)),
         rpdo_lead_us=_extremes(samples["rpdo_lead_ns"] / 1e3),
-        loop_cpu_us_per_cycle=float(samples["loop_cpu_ns"].mean()) / 1e3 if len(samples) else None,
+        loop_cpu_us_per_cycle=float(samples["loop_cpu_ns"].mean()) / 1e3 if samples["loop_cpu_ns"].any() else None,
     )
 
 
@@ -479,6 +483,7 @@ def _axis_json(axis: AxisFigures) -> dict[str, Any]:
         "following_error_deg": _table(axis.following_error_deg),
         "position_actual_counts": _table(axis.position_actual_counts),
         "displacement_deg": _rounded(axis.displacement_deg),
+        "demand_displacement_deg": _rounded(axis.demand_displacement_deg),
         "velocity_actual_counts_per_s": _table(axis.velocity_actual_counts_per_s),
         "velocity_smoothed_counts_per_s": _table(axis.velocity_smoothed_counts_per_s),
         "demand_velocity_rad_per_s": _table(axis.demand_velocity_rad_per_s),

@@ -85,7 +85,7 @@ def to_png(plot: Plot, data: RunData) -> bytes:
     """The figure as PNG, light, 160 dots an inch, its title above it."""
     with _mpl.rc_context(_style(PNG_THEME)):
         figure = plot.draw(data, PNG_THEME)
-        figure.suptitle(plot.title, x=0.01, ha="left", fontsize=12, fontweight="semibold", color=PNG_THEME.ink)
+        figure.suptitle(plot.title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=PNG_THEME.ink)
         FigureCanvasAgg(figure)
         stream = BytesIO()
         figure.savefig(stream, format="png", dpi=160, metadata={"Software": None})
@@ -102,6 +102,8 @@ def to_svg(plot: Plot, data: RunData) -> str:
         figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :]
+    # A hundredth of a point is finer than any screen, and halves the page.
+    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
     for name, marker in _PAGE_COLOURS.items():
         svg = svg.replace(marker, f"var(--{name})")
     # One page holds several figures: their ids must differ.
@@ -222,7 +224,10 @@ def _over_the_cycle(axes: Axes) -> None:
 
 def _legend(axes: Axes, theme: Theme, **keywords: Any) -> None:
     if axes.get_legend_handles_labels()[1]:
-        axes.legend(labelcolor=theme.ink, **keywords)
+        legend = axes.legend(labelcolor=theme.ink, **keywords)
+        for handle in legend.legend_handles:
+            if handle.get_alpha() is not None:
+                handle.set_alpha(0.7)  # a single faint line is not to be seen
 
 
 def _degrees_beside(axes: Axes, data: RunData, axis: int, theme: Theme) -> None:
@@ -318,7 +323,7 @@ def _path(data: RunData, theme: Theme) -> Figure:
     left.set_xlabel("x (mm)")
     left.set_ylabel("y (mm)")
     left.set_title("path of the end effector")
-    _legend(left, theme, loc="center", fontsize=8.5)
+    _legend(left, theme, loc="lower right", fontsize=8.5)
     distance = np.hypot(*(actual - desired).T)
     _draw_overlay(right, overlay(data, distance, mask), theme.path, "distance")
     right.set_ylabel("distance from the desired point (mm)")

@@ -53,7 +53,7 @@ def render_page(recording: Recording, data: RunData, report: RunReport, plots: t
     return PAGE.format(
         title=escape(f"{report.constants.config_name}: axis errors"),
         style=STYLE,
-        heading=escape(report.constants.config_name),
+        heading=escape(f"{report.constants.config_name}, axis errors"),
         subtitle=escape(headline(report).partition(": ")[2]),
         tiles=_tiles(report),
         axes=_axes_table(report),
@@ -134,8 +134,8 @@ def _whole_run_table(report: RunReport) -> str:
     extremes = [f"{number(e.max, sign=True)} / {number(e.min, sign=True)}" for e in errors]
     distance = report.whole_run.end_effector_error_mm
     rows = [
-        ["following error, max / min", "counts", *extremes],
-        ["following error, RMS", "counts", *(number(e.rms, 1) for e in errors)],
+        ["error, max / min", "counts", *extremes],
+        ["error, RMS", "counts", *(number(e.rms, 1) for e in errors)],
         ["end effector error, max", "mm", number(distance.max, 2), *[""] * (len(errors) - 1)],
     ]
     head = _row(["ramps included", "unit", *report.constants.axis_names], "th", ("unit",))

@@ -17,7 +17,7 @@ STYLE: Final = """
 }
 * { box-sizing: border-box; }
 body { margin: 0; background: var(--page); color: var(--ink); font: 15px/1.5 var(--font); }
-main { max-width: 980px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
+main { max-width: 1040px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
 h1 { margin: 0; font-size: 1.7rem; letter-spacing: -0.01em; }
 header p { margin: .2rem 0 1.4rem; color: var(--muted); }
 h2 { margin: 2.4rem 0 .7rem; font-size: 1.12rem; }
@@ -35,9 +35,9 @@ figure svg { display: block; width: 100%; height: auto; }
 figcaption { margin-top: .5rem; color: var(--muted); font-size: .87rem; }
 figcaption b { color: var(--ink); font-weight: 600; }
 .scroll { overflow-x: auto; padding: .35rem 1rem; }
-table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
+table { width: 100%; border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .87rem; }
 table.narrow { width: auto; }
-th, td { padding: .38rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--grid); }
+th, td { padding: .36rem .5rem; text-align: right; white-space: nowrap; border-bottom: 1px solid var(--grid); }
 tbody tr:last-child > * { border-bottom: 0; }
 thead th { color: var(--muted); font-weight: 600; }
 th:first-child { padding-left: 0; text-align: left; font-weight: 500; }

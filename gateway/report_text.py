@@ -1,6 +1,6 @@
 """The report of a run as tables for a terminal, beside the paper's figures where the machine is the paper's."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from rich import box
@@ -47,13 +47,13 @@ def axis_rows(figures: PhaseFigures, *, master: int, slave: int, is_reference: b
     def errors(axis: AxisFigures) -> str:
         return pair(axis.following_error_counts.max, axis.following_error_counts.min, 0)
 
-    def each(text: Sequence[str]) -> tuple[str, ...]:
-        return tuple(text)
+    def turning(texts: Iterable[str]) -> tuple[str, ...]:
+        # How far the master has turned says nothing about the machine.
+        return tuple("turns" if axis == master else text for axis, text in enumerate(texts))
 
     servo_demand = pair(*paper.SERVO_DEMAND_VELOCITY_RAD_PER_S, 2)
     servo_velocity = pair(*paper.SERVO_VELOCITY_COUNTS_PER_S, 0)
-    servo_torque = f"{pair(*paper.SERVO_TORQUE_NM[:2], 3)}, {number(paper.SERVO_TORQUE_NM[2], 3)}"
-    cv_torque = f"{pair(*paper.CV_TORQUE_NM[:2], 3)}, {number(paper.CV_TORQUE_NM[2], 3)}"
+    servo_torque, cv_torque = paper.SERVO_TORQUE_NM, paper.CV_TORQUE_NM
     axes = figures.axes
     degrees = [a.following_error_deg for a in axes]
     actual = [a.velocity_actual_counts_per_s for a in axes]
@@ -62,48 +62,53 @@ def axis_rows(figures: PhaseFigures, *, master: int, slave: int, is_reference: b
     torque = [a.torque_actual_nm for a in axes]
     return [
         Row(
-            "following error, max / min",
+            "error, max / min",
             "counts",
-            each([errors(a) for a in axes]),
+            tuple(errors(a) for a in axes),
             beside(
                 f"at most {number(paper.CV_ERROR_EXTREME_COUNTS)}", number(paper.SERVO_ERROR_EXTREME_COUNTS, sign=True)
             ),
         ),
-        Row(
-            "following error, max / min", "deg", each([pair(d.max, d.min, 2) for d in degrees]), beside("1.7", "−10.1")
-        ),
-        Row("following error, RMS", "counts", each([number(a.following_error_counts.rms, 1) for a in axes]), none),
+        Row("error, max / min", "deg", tuple(pair(d.max, d.min, 2) for d in degrees), beside("1.7", "−10.1")),
+        Row("error, RMS", "counts", tuple(number(a.following_error_counts.rms, 1) for a in axes), none),
         Row(
             "greatest error at θ2",
             "deg",
-            each([number(a.following_error_counts.max_abs_at_master_deg, 1) for a in axes]),
+            tuple(number(a.following_error_counts.max_abs_at_master_deg, 1) for a in axes),
             beside("start of cycle", "start of return"),
         ),
         Row(
-            "displacement",
+            "displacement, demand",
             "deg",
-            each([number(a.displacement_deg, 2) for a in axes]),
-            beside("", f"{paper.SERVO_DISPLACEMENT_DEG:.2f} (theory)"),
+            turning(number(a.demand_displacement_deg, 2) for a in axes),
+            beside("", f"{paper.SERVO_DISPLACEMENT_DEG:.2f}"),
         ),
+        Row("displacement, actual", "deg", turning(number(a.displacement_deg, 2) for a in axes), none),
         Row(
             "position, max",
             "counts",
-            each([number(a.position_actual_counts.max) for a in axes]),
+            turning(number(a.position_actual_counts.max) for a in axes),
             beside("", number(paper.SERVO_MAXIMUM_COUNTS)),
         ),
-        Row("demand velocity", "rad/s", each([pair(v.max, v.min, 2) for v in demand]), beside("+6.28", servo_demand)),
+        Row("demand velocity", "rad/s", tuple(pair(v.max, v.min, 2) for v in demand), beside("+6.28", servo_demand)),
         Row(
             "velocity, one sample",
             "counts/s",
-            each([pair(v.max, v.min, 0) for v in actual]),
+            tuple(pair(v.max, v.min, 0) for v in actual),
             beside("", servo_velocity),
         ),
-        Row("velocity, smoothed", "counts/s", each([pair(v.max, v.min, 0) for v in smooth]), none),
+        Row("velocity, smoothed", "counts/s", tuple(pair(v.max, v.min, 0) for v in smooth), none),
         Row(
-            "torque, max / min, RMS",
+            "torque, max / min",
             "N m",
-            each([f"{pair(t.max, t.min, 3)}, {number(t.rms, 3)}" for t in torque]),
-            beside(cv_torque, servo_torque),
+            tuple(pair(t.max, t.min, 3) for t in torque),
+            beside(pair(cv_torque[0], cv_torque[1], 3), pair(servo_torque[0], servo_torque[1], 3)),
+        ),
+        Row(
+            "torque, RMS",
+            "N m",
+            tuple(number(t.rms, 3) for t in torque),
+            beside(number(cv_torque[2], 3), number(servo_torque[2], 3)),
         ),
     ]
 
@@ -133,7 +138,7 @@ def headline(report: RunReport) -> str:
     """The run in one line."""
     cycles = f"{report.machine_cycles} machine cycle{'' if report.machine_cycles == 1 else 's'} at constant speed"
     whole = "" if report.recording_is_complete else "; the recording was never finished"
-    return f"{report.constants.config_name}: {cycles}, stopped by {report.stopped_by}{whole}"
+    return f"{report.constants.config_name}: {cycles}, end: {report.stopped_by}{whole}"
 
 
 def render_report(report: RunReport) -> RenderableType:
@@ -182,8 +187,8 @@ def _whole_run_table(report: RunReport) -> Table:
         table.add_column(name, justify="right")
     errors = [axis.following_error_counts for axis in report.whole_run.axes]
     extremes = [f"{number(e.max, sign=True)} / {number(e.min, sign=True)}" for e in errors]
-    table.add_row("following error, max / min", "counts", *extremes)
-    table.add_row("following error, RMS", "counts", *(number(e.rms, 1) for e in errors))
+    table.add_row("error, max / min", "counts", *extremes)
+    table.add_row("error, RMS", "counts", *(number(e.rms, 1) for e in errors))
     return table
 
 
