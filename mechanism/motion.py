@@ -103,7 +103,8 @@ def _ramp_steps(
     request.current_acceleration = [acceleration]
     request.target_velocity = [target_velocity]
     request.target_acceleration = [0.0]
-    request.max_velocity = [max(abs(velocity), abs(target_velocity)) * 2.0 + 1.0]
+    # Not looked at where the velocity itself is the target, but it has to be there.
+    request.max_velocity = [max(abs(velocity), abs(target_velocity), 1.0)]
     request.max_acceleration = [acceleration_limit]
     request.max_jerk = [jerk_limit]
     trajectory = _RUCKIG.Trajectory(1)

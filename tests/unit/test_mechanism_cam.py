@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import isnan, nan, tau
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +20,14 @@ from mechanism.errors import (
 )
 from mechanism.five_bar import Closure, FiveBar
 
+PATH = Path(__file__).parents[2] / "config" / "desired_path.csv"
 PAPER = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
 LIMITS = CamLimits(velocity_rad_per_s=25.0, acceleration_rad_per_s2=400.0)
 
 
 @pytest.fixture(scope="module")
 def curve() -> DesiredCurve:
-    return load_curve_csv("config/desired_path.csv")
+    return load_curve_csv(PATH)
 
 
 @pytest.fixture(scope="module")

@@ -13,12 +13,13 @@ from mechanism.curve import load_curve_csv
 from mechanism.errors import CamFileError, CamLimitError
 from mechanism.five_bar import FiveBar
 
+PATH = Path(__file__).parents[2] / "config" / "desired_path.csv"
 PAPER = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
 
 
 @pytest.fixture(scope="module")
 def compiled() -> CompiledCam:
-    return compile_cam(load_curve_csv("config/desired_path.csv"), PAPER, CamLimits(25.0, 400.0), tau)
+    return compile_cam(load_curve_csv(PATH), PAPER, CamLimits(25.0, 400.0), tau)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_a_second_write_replaces_the_first(compiled: CompiledCam, tmp_path: Path
 
 
 def test_a_cam_that_breaks_a_limit_is_not_written(tmp_path: Path) -> None:
-    bad = compile_cam(load_curve_csv("config/desired_path.csv"), PAPER, CamLimits(5.0, 400.0), tau)
+    bad = compile_cam(load_curve_csv(PATH), PAPER, CamLimits(5.0, 400.0), tau)
     with pytest.raises(CamLimitError):
         write_cam_file(tmp_path / "cam", bad)
     assert list(tmp_path.iterdir()) == []

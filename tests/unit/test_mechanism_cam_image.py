@@ -51,7 +51,7 @@ def test_crc_is_that_of_the_standard_check_word() -> None:
     ],
 )
 def test_reasons(data: bytes, reason: CamImageFault) -> None:
-    with pytest.raises(CamImageError, match="^cam image: ") as caught:
+    with pytest.raises(CamImageError, match=r"^cam image: ") as caught:
         decode_cam_image(data)
     assert caught.value.reason is reason
     assert isinstance(caught.value, CamFileError)
@@ -87,7 +87,7 @@ def test_encoding_is_decoded_again() -> None:
     theta2 = np.arange(64) * (tau / 64)
     profile = CamProfile.through(theta2, np.cos(theta2))
     data = encode_cam_image(profile, 256, fraction_bits=4)
-    assert len(data) == 24 + 4 + 4 * 256 - 4 + 0 or len(data) == 24 + 4 * 256
+    assert len(data) == 24 + 4 * 256
     assert decode_cam_image(data) == make_cam_image(profile, 256, fraction_bits=4)
 
 

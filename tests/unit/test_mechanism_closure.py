@@ -1,14 +1,15 @@
 """Closure tracking of the paper's task: the figures are those of paper.md."""
 
-from importlib.resources import files
 from math import degrees, tau
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mechanism.cam import CamLimits, compile_cam
 from mechanism.closure import track_closure
-from mechanism.curve import DesiredCurve, parse_curve_csv
-from mechanism.errors import UnreachableError
+from mechanism.curve import DesiredCurve, load_curve_csv
+from mechanism.errors import SingularError, UnreachableError
 from mechanism.five_bar import Closure, Elbow, FiveBar
 
 PAPER = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
@@ -16,7 +17,7 @@ PAPER = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
 
 @pytest.fixture(scope="module")
 def curve() -> DesiredCurve:
-    return parse_curve_csv((files("config") / "desired_path.csv").read_text(), "desired_path.csv")
+    return load_curve_csv(Path(__file__).parents[2] / "config" / "desired_path.csv")
 
 
 def test_paper_servo_displacement(curve: DesiredCurve) -> None:
@@ -28,6 +29,7 @@ def test_paper_servo_displacement(curve: DesiredCurve) -> None:
     assert track.immobile_points == 0
     assert track.net_turns == 0
     assert track.closure is Closure.LEFT
+    assert set(track.elbows.tolist()) == {int(Elbow.RIGHT)}
     track.require_mobile(PAPER)
 
 
@@ -82,3 +84,18 @@ def test_the_closure_that_passes_no_singular_position_is_taken(curve: DesiredCur
     line, offset = PAPER.servo_end(other) - joint_a, curve.points - joint_a
     side = line[:, 0] * offset[:, 1] - line[:, 1] * offset[:, 0]
     assert side.min() < 0.0 < side.max()
+
+
+def test_a_curve_that_needs_both_closures_has_none() -> None:
+    # Link s is short, so that D hardly leaves its pivot and cannot decide on which side of A to D the end effector lies.
+    bar = FiveBar(0.05, 0.25, 0.25, 0.01, (0.0, 0.0), (0.25, 0.0))
+    theta2 = np.arange(12) * (tau / 12)
+    left, right = (bar.end_effector(theta2, 0.0, closure) for closure in (Closure.LEFT, Closure.RIGHT))
+    points = np.where((np.arange(12) < 6)[:, np.newaxis], left, right)
+    curve = DesiredCurve(theta2, points[:, 0], points[:, 1])
+    track = track_closure(curve, bar)
+    assert track.immobile == ()
+    assert track.closure is None
+    cam = compile_cam(curve, bar, CamLimits(1e9, 1e9), tau)
+    with pytest.raises(SingularError, match="links q and r"):
+        cam.require()

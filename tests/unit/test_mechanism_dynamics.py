@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from math import radians, tau
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from mechanism.dynamics import (
 from mechanism.errors import ParameterError
 from mechanism.five_bar import Closure, FiveBar
 
+PATH = Path(__file__).parents[2] / "config" / "desired_path.csv"
 PAPER = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
 NOTHING = LinkParameters(0.0, 0.0, 0.0, 0.0)
 # Steel crank 150 x 40 x 10 mm with 125 g at A; q, r, s aluminium 15 x 4 mm; 12 g at C and at D.
@@ -125,7 +127,7 @@ def test_joint_positions_and_sine_at_the_reference_position() -> None:
 
 def test_paper_machine_over_the_cam_at_60_rpm() -> None:
     """paper.md: servo about -0.79 / +0.53 N m with physical bars; CV of the order of Table I's -0.57 / +0.61 N m."""
-    track = track_closure(load_curve_csv("config/desired_path.csv"), PAPER)
+    track = track_closure(load_curve_csv(PATH), PAPER)
     profile = CamProfile.through(track.theta2, track.theta5)
     theta2 = np.arange(3600) * (tau / 3600)
     motion = profile.at_many(theta2)

@@ -34,7 +34,7 @@ def test_phases_follow_each_other() -> None:
 
 
 def test_a_run_that_fits_exactly_is_not_made_a_turn_longer() -> None:
-    # Ramps of v^2/a + v a/j in all: 20 pi rad/s at 40 pi and 80 pi: 10 + 10 rev... whole turns, so nothing to add.
+    # Both ramps together turn v^2/a + v a/j: in turns 16/4 + 4 x 4/8 = 6, a whole number, so nothing is added.
     plan = plan_run(0.0, 4 * tau, 3, 4 * tau, 8 * tau)
     ramps = (4.0**2 / 4.0 + 4.0 * 4.0 / 8.0) * tau
     assert plan.end_position == pytest.approx(ramps + 3 * tau)
@@ -87,7 +87,8 @@ def test_impossible_runs_are_refused(arguments: tuple[float, float, int, float, 
 
 
 def test_impossible_stops_are_refused() -> None:
-    with pytest.raises(MotionError, match="must be finite"):
-        plan_stop(0.0, nan, 0.0, 1.0, 1.0)
+    for state in ((nan, 1.0, 1.0), (0.0, nan, 0.0), (0.0, 0.0, nan)):
+        with pytest.raises(MotionError, match=r"position, velocity and acceleration must be finite$"):
+            plan_stop(*state, 1.0, 1.0)
     with pytest.raises(MotionError, match="acceleration limit"):
         plan_stop(0.0, 1.0, 0.0, 0.0, 1.0)
