@@ -87,7 +87,7 @@ def test_the_closure_that_passes_no_singular_position_is_taken(curve: DesiredCur
 
 
 def test_a_curve_that_needs_both_closures_has_none() -> None:
-    # Link s is short, so that D hardly leaves its pivot and cannot decide on which side of A to D the end effector lies.
+    # Link s is short: D hardly leaves its pivot and cannot decide on which side of A to D the end effector lies.
     bar = FiveBar(0.05, 0.25, 0.25, 0.01, (0.0, 0.0), (0.25, 0.0))
     theta2 = np.arange(12) * (tau / 12)
     left, right = (bar.end_effector(theta2, 0.0, closure) for closure in (Closure.LEFT, Closure.RIGHT))
