@@ -14,6 +14,7 @@ from gateway.commissioning import NetworkSettings, NodeSettings
 from gateway.core import AxisSetup, GatewayCore
 from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.demand import CamDemand
+from gateway.errors import GatewayError
 from gateway.guard import Guard
 from gateway.run_constants import AxisConstants, MechanismConstants, RunConstants
 from gateway.units import AxisUnits
@@ -70,12 +71,12 @@ def compile_config(config: GatewayConfig) -> CompiledCam:
 def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict: bool = True) -> PreparedRun:
     """Compile, check and plan; ``machine_cycles`` overrides the configuration's.
 
-    Raises the first violation as a mechanism.errors.MechanismError if ``is_strict``.
+    Raises GatewayError with a sentence for every violation if ``is_strict``.
     """
     cam = compile_config(config)
     violations = (*cam.violations, *_ramp_violations(config, cam.profile))
     if is_strict and violations:
-        raise violations[0]
+        raise GatewayError("\n".join(str(violation) for violation in violations))
     return PreparedRun(config, cam, plan(config, machine_cycles), violations)
 
 

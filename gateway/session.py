@@ -82,12 +82,14 @@ def run_realtime(
 ) -> None:
     """Carry out a prepared run on a bus and record it.
 
-    Raises GatewayError with what went wrong: a bus that is not there, drives that are not what they should be, a
-    process that died. A stop that the guard called for is no error here; the recording says ``stopped_by``.
+    Raises BusError for a bus that is not there, GatewayError with what else went wrong: drives that are not what they
+    should be, a process that died. A stop that the guard called for is no error here; the recording says ``stopped_by``.
     """
     config = prepared.config
     constants = run_constants(config, prepared.cam)
     failures: list[str] = []
+    # A bus that is not there is told before a recording is begun.
+    address.open().close()
     start_ns = time.monotonic_ns()
     start_wall_ns = time.time_ns()
     with RingWriter.create(config.name, constants) as ring, tempfile.TemporaryDirectory() as folder:
