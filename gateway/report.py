@@ -10,7 +10,7 @@ from gateway.analysis import RunData, RunReport, cam_of, prepare, report_of
 from gateway.plots import Plot, plots_of, to_png, to_svg
 from gateway.recording import Recording, RecordingError, read_recording
 from gateway.report_page import PAGE, STYLE
-from gateway.report_text import axis_rows, cycle_rows, headline, number, point
+from gateway.report_text import axis_rows, cycle_rows, headline, is_bad, number, point
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -165,7 +165,8 @@ def _table_ii(report: RunReport) -> str:
 
 
 def _cycle_table(report: RunReport) -> str:
-    body = "".join(_row([what, figure]) for what, figure in cycle_rows(report.cycle))
+    rows = cycle_rows(report.cycle)
+    body = "".join(_row([what, figure], classes=("bad",) if is_bad(what, figure) else ()) for what, figure in rows)
     return f'<div class="scroll"><table class="narrow"><tbody>{body}</tbody></table></div>'
 
 
@@ -178,10 +179,11 @@ def _events(recording: Recording) -> str:
         _row(
             [
                 f"{(int(event.data['at_ns']) - start) / 1e9:.3f} s",
+                str(event.data.get("source", "")),
                 str(event.data.get("kind", "")),
                 str(event.data.get("text", "")),
             ],
-            classes=("left", "left"),
+            classes=("left", "left", "left"),
         )
         for event in shown
     )

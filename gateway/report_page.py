@@ -44,6 +44,7 @@ th:first-child { padding-left: 0; text-align: left; font-weight: 500; }
 .unit { color: var(--muted); text-align: left; }
 .left { text-align: left; white-space: normal; }
 .paper { color: var(--path); }
+td.bad { color: var(--bad); font-weight: 700; }
 details { padding: .6rem 1rem; }
 summary { cursor: pointer; font-weight: 600; }
 pre { overflow-x: auto; font-size: .82rem; line-height: 1.45; }

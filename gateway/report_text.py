@@ -12,6 +12,7 @@ from gateway import paper_reference as paper
 from gateway.analysis import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
 
 NOTHING = "–"
+_COUNTED_FAULTS = frozenset({"TPDOs missed", "RPDO deadlines missed", "overruns", "samples lost"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,7 @@ def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
 
     lead = cycle.rpdo_lead_us
     return [
-        ("cycles, of", f"{number(cycle.count)}, {cycle.period_s * 1e3:g} ms"),
+        ("cycles recorded", f"{number(cycle.count)} of {cycle.period_s * 1e3:g} ms"),
         ("TPDOs missed", number(cycle.missed_tpdo)),
         ("RPDO deadlines missed", number(cycle.missed_rpdo_deadline)),
         ("overruns", number(cycle.overruns)),
@@ -132,6 +133,11 @@ def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
         ("last RPDO before SYNC, least / greatest", f"{number(lead.min, 1)} / {number(lead.max, 1)} µs"),
         ("processor time of the loop a cycle", f"{number(cycle.loop_cpu_us_per_cycle, 1)} µs"),
     ]
+
+
+def is_bad(what: str, figure: str) -> bool:
+    """Whether a row of ``cycle_rows`` counts something that should not have happened, and did."""
+    return what in _COUNTED_FAULTS and figure != "0"
 
 
 def headline(report: RunReport) -> str:
@@ -166,9 +172,8 @@ def render_report(report: RunReport) -> RenderableType:
     cycle = _table("Cycle, over every record")
     cycle.add_column("")
     cycle.add_column("", justify="right")
-    bad = {"TPDOs missed", "RPDO deadlines missed", "overruns", "samples lost"}
     for what, figure in cycle_rows(report.cycle):
-        cycle.add_row(what, Text(figure, style="bold red" if what in bad and figure != "0" else ""))
+        cycle.add_row(what, Text(figure, style="bold red" if is_bad(what, figure) else ""))
     parts.append(cycle)
     if report.recording:
         parts.append(Text(f"recording: {report.recording}", style="dim"))

@@ -83,7 +83,7 @@ def run_realtime(
     """Carry out a prepared run on a bus and record it.
 
     Raises BusError for a bus that is not there, GatewayError with what else went wrong: drives that are not what they
-    should be, a process that died. A stop that the guard called for is no error here; the recording says ``stopped_by``.
+    should be, a process that died. A stop that the guard called for is no error here: the recording tells it.
     """
     config = prepared.config
     constants = run_constants(config, prepared.cam)

@@ -53,6 +53,7 @@ def test_brake_is_continuous_and_ends_at_v_squared_over_2a(direction: float):
     demand.brake(500 * MICRO, 1e5)
     assert demand.at(500 * MICRO) == pytest.approx(direction * 5.0)
     assert demand.velocity_at(500 * MICRO) == pytest.approx(direction * 1e4)
+    assert demand.velocity_at(0) == pytest.approx(direction * 1e4)
     assert not demand.is_over(100 * MS)
     assert demand.is_over(101 * MS)
     assert demand.at(10**12) == pytest.approx(direction * 505.0)

@@ -240,6 +240,7 @@ def test_type_zero_sends_at_the_sync_after_a_change(bench: Bench):
     assert bench.sync() == ["185#500200000000"]
     assert bench.sync() == []
     bench.drive.latch = lambda now_ns: (5, 0.0, 0)
+    bench.tick()
     assert bench.sync() == []  # a measured value that moves is no event
     bench.control(0x06)
     assert bench.sync() == ["185#310205000000"]
@@ -291,6 +292,7 @@ def test_jitter_of_a_measured_value_does_not_flood(bench: Bench):
     frames: list[str] = []
     for k in range(50):
         bench.shaft = k % 2
+        assert bench.read(0x6064) == (k + 1) % 2 * (k > 0)  # reading it is no event either
         frames += bench.tick()
     assert frames == []
 
