@@ -113,8 +113,9 @@ class EmergencyProducer:
         return code in self._active
 
     def restore(self) -> None:
-        """Bring 1001h up to date after the dictionary's defaults were restored."""
+        """Bring 1001h and 603Fh up to date after the dictionary's defaults were restored."""
         self._register.value = self._combined_register()
+        self._code.value = next(reversed(self._active), int(EmergencyCode.NO_ERROR))
 
     def forget(self) -> None:
         """Lose all errors without a word, save those whose cause persists."""
@@ -131,7 +132,9 @@ class EmergencyProducer:
             known.is_fault = known.is_fault or is_fault
             known.persists = persists
             return
-        self._active[code] = _ActiveError(register | ErrorRegister.GENERIC, is_fault, persists)
+        # Plain integers from here on: enums have names for some values, and a log is to show the same for all.
+        code = int(code)
+        self._active[code] = _ActiveError(int(register | ErrorRegister.GENERIC), is_fault, persists)
         self._code.value = code
         history = self._history
         for place in range(ERROR_HISTORY_LENGTH, 1, -1):
@@ -155,7 +158,7 @@ class EmergencyProducer:
         if self._active:
             self._active.clear()
             self._tell_recovery(now_ns)
-        self._code.value = EmergencyCode.NO_ERROR
+        self._code.value = int(EmergencyCode.NO_ERROR)
 
     def _combined_register(self) -> int:
         self.has_errors = bool(self._active)
@@ -168,7 +171,7 @@ class EmergencyProducer:
         if self._active:
             self._register.value = self._combined_register()
         else:
-            self._tell(EmergencyCode.NO_ERROR, now_ns)
+            self._tell(int(EmergencyCode.NO_ERROR), now_ns)
 
     def _tell(self, code: int, now_ns: int) -> None:
         register = self._combined_register()

@@ -301,6 +301,7 @@ def test_persisting_trip_outlives_fault_resets_and_a_node_reset(bench: Bench):
     bench.tick()
     assert bench.statusword & 0x4F == 0x08
     assert bench.read(0x1001) == 0x81
+    assert bench.read(0x603F) == 0xFF10
     bench.drive.end_trip(0xFF10, bench.now_ns)
     bench.control(0x80)
     bench.sent()
