@@ -82,12 +82,12 @@ class _Following(IntEnum):
 class Axis:
     """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it.
 
-    In csp a target that a SYNC brings into effect is reached in a straight line one interpolation time (60C2h) later. If
-    the next one is missing, the line goes on for one more interpolation time, then the position is held; after
+    In csp a target that a SYNC brings into effect is reached in a straight line one interpolation time (60C2h) later.
+    If the next one is missing, the line goes on for one more interpolation time, then the position is held; after
     ``missing_set_point_limit`` interpolation times without a set-point the drive faults (8700h). A target by SDO or by
     an event-driven RPDO acts at once, promises no successor, and so is neither overrun nor guarded. Camming treats the
-    master position in the same way, but takes an event-driven RPDO for a cyclic one too. Controlword bit 8 (halt) has no
-    effect in the modes that the drive has.
+    master position in the same way, but takes an event-driven RPDO for a cyclic one too. Controlword bit 8 (halt) has
+    no effect in the modes that the drive has.
     """
 
     __slots__ = (

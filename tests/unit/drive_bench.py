@@ -8,7 +8,7 @@ from drivers.eds import load_eds
 from drivers.frame import Frame
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.errors import CamFileError
-from sim_drive.cam_slots import CamTable
+from sim_drive.cam_slots import CamDecoder, CamTable
 from sim_drive.drive import Drive, DriveSettings
 
 EDS = Path(__file__).parents[2] / "config" / "eds" / "sim_drive.eds"
@@ -52,9 +52,15 @@ def decode_bench_image(image: bytes) -> CamTable:
 class Bench:
     """Node 5 by default, booted and ticked once, with nothing in its outbox."""
 
-    def __init__(self, settings: DriveSettings | None = None, node_id: int = 5, boot: bool = True) -> None:
+    def __init__(
+        self,
+        settings: DriveSettings | None = None,
+        node_id: int = 5,
+        boot: bool = True,
+        decode: CamDecoder = decode_bench_image,
+    ) -> None:
         self.node_id = node_id
-        self.drive = Drive(node_id, described(node_id), settings or DriveSettings(), decode_bench_image)
+        self.drive = Drive(node_id, described(node_id), settings or DriveSettings(), decode)
         self.now_ns = 0
         self.shaft = 0
         self.aside: list[str] = []
