@@ -281,9 +281,8 @@ class GatewayConfig(Model):
         users: dict[int, str] = {self.bus.gateway_node_id: "bus.gateway_node_id"}
         for name, axis in self.axes.items():
             if axis.node_id in users:
-                raise ValueError(
-                    f"axes.{name}.node_id: {axis.node_id} is taken by {users[axis.node_id]}, every node id must be unique"
-                )
+                taken = f"{axis.node_id} is taken by {users[axis.node_id]}"
+                raise ValueError(f"axes.{name}.node_id: {taken}, every node id must be unique")
             users[axis.node_id] = f"axes.{name}"
         if self.bus.interpolation_time() is None:
             raise ValueError(

@@ -1,5 +1,9 @@
 """Events of the cores in words and as data, for the event log of a run."""
 
+import re
+from dataclasses import fields
+from enum import Enum
+
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
 from drivers.node import Event
 from gateway.core import StepReached
@@ -9,7 +13,7 @@ EventData = dict[str, str | int | float | bool | None]
 
 
 def describe(event: Event) -> tuple[str, str, EventData]:
-    """Kind, sentence and data of an event; an event that is not the gateway's is told by its name."""
+    """Kind, sentence and data of an event; an event that is not the gateway's is told by its name and fields."""
     match event:
         case StepReached(_, step):
             return "step", step, {}
@@ -29,4 +33,13 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             text = f"node {node_id} is {state.name.lower().replace('_', '-')}"
             return "nmt_state", text, {"node_id": node_id, "state": state.name.lower()}
         case _:
-            return "event", type(event).__name__, {}
+            return _describe_other(event)
+
+
+def _describe_other(event: Event) -> tuple[str, str, EventData]:
+    """An event of a room that this one does not know: its name and its fields, in words."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", " ", type(event).__name__).lower()
+    values = {field.name: getattr(event, field.name) for field in fields(event) if field.name != "at_ns"}
+    shown = {key: value.name.lower() if isinstance(value, Enum) else str(value) for key, value in values.items()}
+    text = ", ".join(f"{key.replace('_', ' ')} {value.replace('_', ' ')}" for key, value in shown.items())
+    return name.replace(" ", "_"), f"{name}: {text}" if text else name, {**shown}
