@@ -204,10 +204,12 @@ class SocketcandServer:
 
     def _flush(self, now_ns: int) -> None:
         for client in tuple(self._clients):
-            if client.output and client.held_until_ns <= now_ns:
+            if not client.output:
+                continue
+            if client.held_until_ns <= now_ns:
                 self._write(client)
-                if len(client.output) > MAX_BACKLOG_BYTES:
-                    self._drop(client, f"it has left {len(client.output)} bytes unread", logging.WARNING)
+            if len(client.output) > MAX_BACKLOG_BYTES:
+                self._drop(client, f"it has left {len(client.output)} bytes unread", logging.WARNING)
 
     def _write(self, client: _Client) -> None:
         try:
