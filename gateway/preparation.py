@@ -16,7 +16,6 @@ from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
-from gateway.run_constants import AxisConstants, MechanismConstants, RunConstants
 from gateway.units import AxisUnits
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
@@ -179,30 +178,3 @@ def build_core(
         config.motion.ramp_jerk_rad_per_s3,
     )
     return GatewayCore(setups, network_settings(config), build_master(config), loop, demand, run_plan, guard)
-
-
-def run_constants(config: GatewayConfig, cam: CompiledCam) -> RunConstants:
-    """What a reader of the run's samples must know about the machine."""
-    bar = cam.five_bar
-    return RunConstants(
-        config_name=config.name,
-        period_s=config.cycle_s,
-        axes=tuple(
-            AxisConstants(
-                name=name,
-                counts_per_revolution=axis.counts_per_revolution,
-                rated_torque_nm=axis.rated_torque_Nm,
-                zero_rad=math.radians(axis.home_angle_deg),
-            )
-            for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
-        ),
-        mechanism=MechanismConstants(
-            p_m=bar.p,
-            q_m=bar.q,
-            r_m=bar.r,
-            s_m=bar.s,
-            cv_pivot_m=bar.cv_pivot,
-            servo_pivot_m=bar.servo_pivot,
-            closure=int(cam.closure),
-        ),
-    )

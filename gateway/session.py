@@ -17,8 +17,9 @@ from typing import Any, Final
 from gateway.bus_address import BusAddress
 from gateway.cyclic_process import CyclicJob
 from gateway.errors import GatewayError
-from gateway.preparation import PreparedRun, run_constants
+from gateway.preparation import PreparedRun
 from gateway.ring import RingReader, RingWriter, RunState, StopRequest
+from gateway.run_constants import RunConstants
 
 POLL_S: Final = 0.1
 RECORDER_TIMEOUT_S: Final = 30.0
@@ -86,7 +87,7 @@ def run_realtime(
     should be, a process that died. A stop that the guard called for is no error here: the recording tells it.
     """
     config = prepared.config
-    constants = run_constants(config, prepared.cam)
+    constants = RunConstants.from_config(config, prepared.cam.closure)
     failures: list[str] = []
     # A bus that is not there is told before a recording is begun.
     address.open().close()

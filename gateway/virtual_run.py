@@ -10,8 +10,9 @@ from drivers.virtual_time import VirtualBus
 from gateway.core import GatewayCore
 from gateway.errors import GatewayError
 from gateway.event_text import describe
-from gateway.preparation import PreparedRun, build_core, run_constants
+from gateway.preparation import PreparedRun, build_core
 from gateway.recording import RecordingMetadata, RecordingSink, RecordingWriter
+from gateway.run_constants import RunConstants
 
 NS_PER_S: Final = 1_000_000_000
 MAX_EXTRA_S: Final = 60.0
@@ -41,7 +42,7 @@ def run_virtual(
     Raises RecordingError if the file cannot be written, GatewayError if the session does not end.
     """
     config = prepared.config
-    metadata = RecordingMetadata(run_constants(config, prepared.cam), config.text, cam_text)
+    metadata = RecordingMetadata(RunConstants.from_config(config, prepared.cam.closure), config.text, cam_text)
     with RecordingWriter(path, metadata, overwrite=is_overwriting) as writer:
         sink = RecordingSink(writer)
         core = build_core(config, prepared.cam.profile, prepared.plan, sink)
