@@ -15,12 +15,18 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
+from drivers.errors import BusError
+from drivers.ports import Port
+from gateway.bus_address import BusAddress
 from gateway.errors import GatewayError
 from gateway.recording import RecordingError, RecordingMetadata, RecordingWriter
-from gateway.ring import RingReader, RunState
+from gateway.ring import FRAME_DTYPE, FRAME_STRUCT, FrameArray, RingReader, RunEvent, RunState
 
 _DRAIN_S: Final = 0.05
 _DRAINS_A_FLUSH: Final = 4
+MAX_FRAMES_A_DRAIN: Final = 20_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +41,43 @@ class RecorderResult:
     lost_events: int
 
 
-class Recorder:
-    """Moves whatever is new in ``ring`` into ``writer``."""
+class BusListener:
+    """Takes down every frame on the bus, with a connection of its own, so that it costs the cycle nothing."""
 
-    def __init__(self, ring: RingReader, writer: RecordingWriter) -> None:
+    def __init__(self, port: Port) -> None:
+        self._port: Port | None = port
+        self.failure = ""
+        """Why the bus is not heard any more, empty while it is."""
+
+    def read(self) -> FrameArray:
+        """Frames that have arrived since the last call; at most a second of a full bus."""
+        packed = bytearray()
+        try:
+            for _ in range(MAX_FRAMES_A_DRAIN):
+                received = self._port.receive() if self._port is not None else None
+                if received is None:
+                    break
+                frame, at_ns = received
+                packed += FRAME_STRUCT.pack(at_ns, frame.cob_id, frame.is_remote, len(frame.data), frame.data)
+        except BusError as error:
+            self.failure = str(error)
+            self.close()
+        return np.frombuffer(bytes(packed), FRAME_DTYPE)
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+
+class Recorder:
+    """Moves whatever is new in ``ring``, and on the bus where there is a listener, into ``writer``."""
+
+    def __init__(self, ring: RingReader, writer: RecordingWriter, listener: BusListener | None = None) -> None:
         self._ring = ring
         self._writer = writer
+        self._listener = listener
         self._counts = [0, 0, 0]
         self._lost = [0, 0, 0]
         self._stopped_by = ""
@@ -52,6 +89,10 @@ class Recorder:
         events, lost_events = self._ring.read_new_events()
         self._writer.write_samples(samples)
         self._writer.write_frames(frames)
+        if self._listener is not None:
+            heard = self._listener.read()
+            self._writer.write_frames(heard)
+            self._counts[1] += len(heard)
         for event in events:
             self._writer.write_event(event)
             self._stopped_by = str(event.data.get("stopped_by", self._stopped_by))
@@ -96,8 +137,11 @@ def run_recorder(
     start_ns: int = 0,
     start_wall_ns: int | None = None,
     overwrite: bool = False,
+    bus: BusAddress | None = None,
 ) -> RecorderResult:
-    """Record the run of a ring until it is over; blocks. To be called in a process of its own, on its main thread.
+    """Record the run of a ring until it is over, and every frame on ``bus`` where that is given; blocks.
+
+    To be called in a process of its own, on its main thread.
 
     Raises ``RingError``, and ``RecordingError`` also where the disk is full.
     """
@@ -107,11 +151,14 @@ def run_recorder(
     with RingReader(ring_path) as ring:
         metadata = RecordingMetadata(ring.constants, config_text, cam_text, start_ns, start_wall_ns)
         writer = RecordingWriter(out_path, metadata, overwrite=overwrite)
-        recorder = Recorder(ring, writer)
+        listener = _listen(bus, writer, start_ns)
+        recorder = Recorder(ring, writer, listener)
         try:
             try:
                 _drain_to_the_end(ring, recorder, writer, stopping)
             finally:
+                if listener is not None:
+                    listener.close()
                 writer.close(recorder.outcome("recorder_stopped" if stopping else ""))
         except OSError as error:
             raise RecordingError(out_path, f"cannot be written: {error.strerror}") from error
@@ -132,6 +179,24 @@ def _drain_to_the_end(ring: RingReader, recorder: Recorder, writer: RecordingWri
         time.sleep(_DRAIN_S)
 
 
+def _listen(bus: BusAddress | None, writer: RecordingWriter, at_ns: int) -> BusListener | None:
+    """A listener on the bus; one that cannot be had is an event of the recording, and no reason not to record."""
+    if bus is None:
+        return None
+    try:
+        return BusListener(bus.open())
+    except BusError as error:
+        writer.write_event(RunEvent({"at_ns": at_ns, "kind": "warning", "text": f"frames are not recorded: {error}"}))
+        return None
+
+
+def _bus(words: Sequence[str] | None) -> BusAddress | None:
+    if not words:
+        return None
+    interface, channel, host, port = words
+    return BusAddress(interface, channel, host, int(port))
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """``python -m gateway.recorder RING OUT [--config FILE] [--cam FILE]``; prints the result as a line of JSON."""
     parser = argparse.ArgumentParser(prog="python -m gateway.recorder", description="Record the run of a ring to MCAP.")
@@ -141,6 +206,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cam", type=Path, help="cam file to attach")
     parser.add_argument("--start-ns", type=int, default=0, help="reading of the loop's clock that becomes time 0")
     parser.add_argument("--start-wall-ns", type=int, help="wall clock at --start-ns, ns since 1970")
+    parser.add_argument("--bus", help="also record every frame of this bus: INTERFACE CHANNEL HOST PORT", nargs=4)
     parser.add_argument("--overwrite", action="store_true", help="replace an existing recording")
     options = parser.parse_args(arguments)
     try:
@@ -152,6 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             start_ns=options.start_ns,
             start_wall_ns=options.start_wall_ns,
             overwrite=options.overwrite,
+            bus=_bus(options.bus),
         )
     except GatewayError as error:
         sys.stderr.write(f"{error}\n")

@@ -78,10 +78,11 @@ def run_realtime(
     *,
     machine_cycles: int,
     is_overwriting: bool = False,
+    with_frames: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> None:
-    """Carry out a prepared run on a bus and record it.
+    """Carry out a prepared run on a bus and record it; ``with_frames`` also records every frame on the bus.
 
     Raises BusError for a bus that is not there, GatewayError with what else went wrong: drives that are not what they
     should be, a process that died. A stop that the guard called for is no error here: the recording tells it.
@@ -101,6 +102,7 @@ def run_realtime(
         command += ["--config", str(config_file), "--cam", str(cam_file)]
         command += ["--start-ns", str(start_ns), "--start-wall-ns", str(start_wall_ns)]
         command += ["--overwrite"] if is_overwriting else []
+        command += ["--bus", address.interface, address.channel, address.host, str(address.port)] if with_frames else []
         environment = _python_environment()
         recorder = subprocess.Popen(  # noqa: S603 -- our own module
             command,

@@ -85,7 +85,13 @@ def _prepare(config: "GatewayConfig", cycles: int | None) -> "tuple[PreparedRun,
 
 
 def _run_on_bus(
-    prepared: "PreparedRun", cam: str, address: "BusAddress", recording: Path, cycles: int, is_overwriting: bool
+    prepared: "PreparedRun",
+    cam: str,
+    address: "BusAddress",
+    recording: Path,
+    cycles: int,
+    is_overwriting: bool,
+    frames: bool | None,
 ) -> None:
     from gateway.session import Progress as RunProgress
     from gateway.session import StopSwitch, run_realtime
@@ -117,12 +123,15 @@ def _run_on_bus(
             switch,
             machine_cycles=cycles,
             is_overwriting=is_overwriting,
+            with_frames=address.interface == "socketcan" if frames is None else frames,
             on_progress=on_progress,
             on_event=on_event,
         )
 
 
-def _run_virtually(prepared: "PreparedRun", cam: str, recording: Path, seed: int, is_overwriting: bool) -> float:
+def _run_virtually(
+    prepared: "PreparedRun", cam: str, recording: Path, seed: int, is_overwriting: bool, with_frames: bool = True
+) -> float:
     """Carry out the run in virtual time; returns machine seconds per second."""
     from gateway.core import GatewayCore
     from gateway.session import StopSwitch
@@ -149,7 +158,14 @@ def _run_virtually(prepared: "PreparedRun", cam: str, recording: Path, seed: int
             )
 
         core = run_virtual(
-            prepared, machine, recording, cam, seed, is_overwriting=is_overwriting, on_progress=on_progress
+            prepared,
+            machine,
+            recording,
+            cam,
+            seed,
+            is_overwriting=is_overwriting,
+            with_frames=with_frames,
+            on_progress=on_progress,
         )
     if core.failure is not None:
         raise core.failure
@@ -187,6 +203,10 @@ def run(
     ] = None,
     virtual_time: VirtualTimeOption = False,
     seed: Annotated[int, typer.Option(min=0, help="With --virtual-time: seed of all that is random.")] = 0,
+    frames: Annotated[
+        bool | None,
+        typer.Option("--frames/--no-frames", help="Record every CAN frame  [default: on socketcan, in virtual time]"),
+    ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     port: PortOption = None,
@@ -202,11 +222,11 @@ def run(
     require_absent(recording, is_overwriting)
     prepared, cam = _prepare(settings, cycles)
     if virtual_time:
-        _run_virtually(prepared, cam, recording, seed, is_overwriting)
+        _run_virtually(prepared, cam, recording, seed, is_overwriting, frames is not False)
     else:
         count = settings.motion.machine_cycles if cycles is None else cycles
         address = resolve_bus(settings.bus, interface, channel, port)
-        _run_on_bus(prepared, cam, address, recording, count, is_overwriting)
+        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames)
     _show(recording, as_json, None)
 
 
@@ -242,5 +262,5 @@ def demo(
         with emulator_process(settings.path, interface=interface, channel=channel, seed=seed) as address:
             console.print(f"the emulated machine is on {address}", markup=False)
             count = settings.motion.machine_cycles if cycles is None else cycles
-            _run_on_bus(prepared, cam, address, recording, count, True)
+            _run_on_bus(prepared, cam, address, recording, count, True, None)
     _show(recording, as_json, output)
