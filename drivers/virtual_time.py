@@ -97,7 +97,9 @@ class VirtualBus:
         self._now_ns = start_ns
         self._busy_ns = 0
         self._frame_count = 0
-        self._wakes: list[int] = [_NEVER] * len(self.nodes)
+        self._wakes: list[int] = [_NEVER] * (len(self.nodes) + 1)
+        """When each node wants to be woken; the last entry stands there for a bus without nodes."""
+        self._earliest_wake_ns = _NEVER
         self._queues: Final = tuple(deque[Frame]() for _ in self.nodes)
         self._on_wire: Frame | None = None
         self._sender = 0
@@ -106,7 +108,7 @@ class VirtualBus:
         self._late_count: Final = itertools.count()
         # Bound methods looked up once: delivering a frame is most of what a run does.
         stations = tuple(
-            (index, node.receive, node.next_wake_ns, node.take_frames, self._queues[index])
+            (index, node.receive, node.take_frames, node.next_wake_ns, node.take_events, self._queues[index])
             for index, node in enumerate(self.nodes)
         )
         self._listeners: Final = tuple(
@@ -132,6 +134,7 @@ class VirtualBus:
         """Ask every node for its frames, events and next wake, after something outside the bus has changed one."""
         for index in range(len(self.nodes)):
             self._settle(index)
+        self._earliest_wake_ns = min(self._wakes)
 
     def run_until(self, time_ns: int) -> None:
         """Run until ``time_ns`` inclusive; what is due at that very instant is done.
@@ -157,39 +160,37 @@ class VirtualBus:
         if limit_ns < self._now_ns:
             raise ValueError(f"time cannot run back from {self._now_ns} ns to {limit_ns} ns")
         self.refresh()
+        late = self._late
         is_arbitration_due = self._on_wire is None and any(self._queues)
         while condition is None or condition():
-            now_ns = self._now_ns if is_arbitration_due else self._next_instant_ns()
-            is_arbitration_due = False
+            if is_arbitration_due:
+                is_arbitration_due = False
+                now_ns = self._now_ns
+            else:
+                now_ns = self._frame_end_ns
+                if self._earliest_wake_ns < now_ns:
+                    now_ns = self._earliest_wake_ns
+                if late and late[0][0] < now_ns:
+                    now_ns = late[0][0]
+                if now_ns < self._now_ns:
+                    now_ns = self._now_ns
             if now_ns > limit_ns:
                 self._now_ns = limit_ns
                 return False
-            self._run_instant(now_ns)
+            self._now_ns = now_ns
+            if self._frame_end_ns <= now_ns:
+                self._end_frame(now_ns)
+            while late and late[0][0] <= now_ns:
+                _, _, sender, frame = heapq.heappop(late)
+                self._deliver(sender, frame, now_ns)
+            if self._earliest_wake_ns <= now_ns:
+                self._wake_due(now_ns)
+            if self._on_wire is None:
+                self._arbitrate(now_ns)
         return True
 
-    def _next_instant_ns(self) -> int:
-        next_ns = min(self._wakes, default=_NEVER)
-        if self._frame_end_ns < next_ns:
-            next_ns = self._frame_end_ns
-        if self._late and self._late[0][0] < next_ns:
-            next_ns = self._late[0][0]
-        return next_ns if next_ns > self._now_ns else self._now_ns
-
-    def _run_instant(self, now_ns: int) -> None:
-        self._now_ns = now_ns
-        if self._frame_end_ns <= now_ns:
-            self._end_frame(now_ns)
-        late = self._late
-        while late and late[0][0] <= now_ns:
-            _, _, sender, frame = heapq.heappop(late)
-            self._deliver(sender, frame, now_ns)
-        for index, wake_ns in enumerate(self._wakes):
-            if wake_ns <= now_ns:
-                self._wake(index, now_ns)
-        if self._on_wire is None:
-            self._arbitrate(now_ns)
-
     def _arbitrate(self, now_ns: int) -> None:
+        """Put the frame of the highest priority on the wire, if there is one."""
         best = _NEVER
         winner = -1
         for index, queue in enumerate(self._queues):
@@ -200,12 +201,12 @@ class VirtualBus:
                     best = priority
                     winner = index
         if winner >= 0:
-            frame = self._queues[winner].popleft()
-            self._on_wire = frame
+            self._on_wire = frame = self._queues[winner].popleft()
             self._sender = winner
             self._frame_end_ns = now_ns + self._wire_ns[len(frame.data)]
 
     def _end_frame(self, now_ns: int) -> None:
+        """Take the frame off the wire and deliver it, or do with it what the faults say."""
         frame = self._on_wire
         if frame is None:
             return
@@ -228,7 +229,7 @@ class VirtualBus:
             self._trace(now_ns, frame)
         wakes = self._wakes
         on_event = self._on_event
-        for index, receive, next_wake_ns, take_frames, queue in self._listeners[sender]:
+        for index, receive, take_frames, next_wake_ns, take_events, queue in self._listeners[sender]:
             receive(frame, now_ns)
             frames = take_frames()
             if frames:
@@ -236,19 +237,27 @@ class VirtualBus:
             wake_ns = next_wake_ns()
             wakes[index] = _NEVER if wake_ns is None else wake_ns
             if on_event is not None:
-                for event in self.nodes[index].take_events():
+                for event in take_events():
                     on_event(index, event)
+        self._earliest_wake_ns = min(wakes)
 
-    def _wake(self, index: int, now_ns: int) -> None:
-        node = self.nodes[index]
-        for _ in range(MAX_WAKES_PER_INSTANT):
-            node.wake(now_ns)
-            self._settle(index)
-            if self._wakes[index] > now_ns:
-                return
-        raise LivelockError(index, node, now_ns, self._wakes[index], MAX_WAKES_PER_INSTANT)
+    def _wake_due(self, now_ns: int) -> None:
+        """Wake the nodes that are due, in their order, each until it wants nothing more at this instant."""
+        wakes = self._wakes
+        for index, node in enumerate(self.nodes):
+            if wakes[index] > now_ns:
+                continue
+            for _ in range(MAX_WAKES_PER_INSTANT):
+                node.wake(now_ns)
+                self._settle(index)
+                if wakes[index] > now_ns:
+                    break
+            else:
+                raise LivelockError(index, node, now_ns, wakes[index], MAX_WAKES_PER_INSTANT)
+        self._earliest_wake_ns = min(wakes)
 
     def _settle(self, index: int) -> None:
+        """Take what a node has to send and to tell, and when it wants to be woken."""
         node = self.nodes[index]
         frames = node.take_frames()
         if frames:
