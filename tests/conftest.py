@@ -18,12 +18,12 @@ PATIENCE_S = 120.0
 
 
 @contextmanager
-def sim_drive_process(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
+def sim_drive_process(folder: Path, config: str, options: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     complaints = folder / "sim-drive.stderr"
     with complaints.open("w") as stderr:
         process = subprocess.Popen(
-            [sys.executable, "-m", "sim_drive", "paper", "--json", *options],
+            [sys.executable, "-m", "sim_drive", config, "--json", *options],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=stderr,
@@ -46,15 +46,25 @@ def sim_drive_process(folder: Path, *options: str) -> Iterator[dict[str, Any]]:
     assert json.loads(rest.splitlines()[-1])["event"] == "stopped"
 
 
+def sim_drives(folders: pytest.TempPathFactory) -> Iterator[Callable[..., dict[str, Any]]]:
+    with ExitStack() as stack:
+
+        def start(*options: str, config: str = "paper") -> dict[str, Any]:
+            return stack.enter_context(sim_drive_process(folders.mktemp("sim-drive"), config, options))
+
+        yield start
+
+
 @pytest.fixture(scope="module")
 def start_sim_drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., dict[str, Any]]]:
     """``start_sim_drive(*options)`` starts ``sim-drive paper`` and answers where its bus is; ended with the module."""
-    with ExitStack() as stack:
+    yield from sim_drives(tmp_path_factory)
 
-        def start(*options: str) -> dict[str, Any]:
-            return stack.enter_context(sim_drive_process(tmp_path_factory.mktemp("sim-drive"), *options))
 
-        yield start
+@pytest.fixture
+def start_own_sim_drive(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., dict[str, Any]]]:
+    """The same, ended with the test."""
+    yield from sim_drives(tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,152 @@
+"""A gateway killed in motion stops the machine: by the drives' own guard, or by what is left of the gateway."""
+
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import pytest
+
+from drivers.ports import interface_is_up
+from gateway.recording import read_recording
+
+pytestmark = [
+    pytest.mark.vcan,
+    pytest.mark.timeout(400),
+    pytest.mark.skipif(not interface_is_up("vcan0"), reason="there is no CAN interface vcan0 that is up"),
+]
+
+ROOT = Path(__file__).resolve().parent.parent.parent
+EDS = str(ROOT / "config" / "eds" / "sim_drive.eds")
+PATIENCE_S = 240.0
+MOVING_COUNTS = 1000
+OPERATION_ENABLED = 0x27
+Start = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def bus(start_own_sim_drive: Callable[..., dict[str, Any]], unhurried: Path) -> Iterator[can.BusABC]:
+    """The bus of an emulated machine at its home position; SYNC, EMCY and the first TPDOs pass."""
+    start_own_sim_drive("--interface", "socketcan", "--channel", "vcan0", "--realtime", config=str(unhurried))
+    filters: list[Any] = [{"can_id": service, "can_mask": 0x780} for service in (0x080, 0x180)]
+    with can.Bus(interface="socketcan", channel="vcan0", can_filters=filters) as bus:
+        yield bus
+
+
+@pytest.fixture
+def drives() -> Iterator[list[canopen.RemoteNode]]:
+    network = canopen.Network()
+    network.connect(interface="socketcan", channel="vcan0")
+    nodes = [network.add_node(node_id, EDS) for node_id in (1, 2)]
+    for node in nodes:
+        node.sdo.RESPONSE_TIMEOUT = PATIENCE_S
+    yield nodes
+    network.disconnect()
+
+
+def child_of(process: "subprocess.Popen[str]", module: str) -> int:
+    """Process id of the child that runs ``module``."""
+    for folder in Path("/proc").iterdir():
+        if not folder.name.isdigit():
+            continue
+        try:
+            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+            command = (folder / "cmdline").read_bytes().decode().split("\0")
+        except OSError:
+            continue
+        if parent == process.pid and module in command:
+            return int(folder.name)
+    raise AssertionError(f"no child of {process.pid} runs {module}")
+
+
+def wait_for_motion(bus: can.BusABC, process: "subprocess.Popen[str]") -> None:
+    """Return when the CV axis is enabled and has turned by MOVING_COUNTS."""
+    for _ in range(200_000):
+        message = bus.recv(PATIENCE_S)
+        assert message is not None, "the bus is silent"
+        assert process.poll() is None, "the run is over already"
+        if message.arbitration_id != 0x181:
+            continue
+        statusword = int.from_bytes(message.data[:2], "little")
+        position = int.from_bytes(message.data[2:6], "little", signed=True)
+        if statusword & 0x6F == OPERATION_ENABLED and abs(position) > MOVING_COUNTS:
+            return
+    raise AssertionError("the machine never moved")
+
+
+def wait_until_disabled(node: canopen.RemoteNode) -> int:
+    """The statusword's state once the drive has left Operation enabled, and has come to its rest."""
+    for _ in range(100_000):
+        state = node.sdo[0x6041].raw & 0x6F
+        if state & 0x4F in {0x08, 0x40}:
+            return state & 0x4F
+    raise AssertionError(f"node {node.id} is still in state {state:02X}")
+
+
+def wait_for_rest(drives: list[canopen.RemoteNode]) -> None:
+    for _ in range(2000):
+        before = [node.sdo[0x6064].raw for node in drives]
+        at_rest = all(node.sdo[0x606C].raw == 0 for node in drives)
+        if at_rest and [node.sdo[0x6064].raw for node in drives] == before:
+            return
+    raise AssertionError("the machine never came to rest")
+
+
+def emergencies(bus: can.BusABC) -> dict[int, list[int]]:
+    """The emergency error codes that wait in the bus' queue, by node."""
+    codes: dict[int, list[int]] = {}
+    while (message := bus.recv(0)) is not None:
+        if 0x080 < message.arbitration_id < 0x100:
+            code = int.from_bytes(message.data[:2], "little")
+            codes.setdefault(message.arbitration_id - 0x080, []).append(code)
+    return codes
+
+
+def start_run(drive_gateway: Start, unhurried: Path, folder: Path) -> "subprocess.Popen[str]":
+    options = ("-i", "socketcan", "-c", "vcan0", "--cycles", "500", "--record", "run.mcap", "--json")
+    return drive_gateway("run", unhurried, *options, folder=folder)
+
+
+def test_a_killed_cyclic_process_is_a_fault_of_every_drive(
+    unhurried: Path, drive_gateway: Start, drives: list[canopen.RemoteNode], bus: can.BusABC, tmp_path: Path
+) -> None:
+    process = start_run(drive_gateway, unhurried, tmp_path)
+    wait_for_motion(bus, process)
+    os.kill(child_of(process, "gateway.cyclic_process"), signal.SIGKILL)
+
+    # Heartbeat lost, fault reaction, fault: with nobody left to tell them.
+    assert [wait_until_disabled(node) for node in drives] == [0x08, 0x08]
+    assert [node.sdo[0x603F].raw for node in drives] == [0x8130, 0x8130]
+    wait_for_rest(drives)
+    assert emergencies(bus) == {1: [0x8130], 2: [0x8130]}
+
+    output, _ = process.communicate(timeout=PATIENCE_S)
+    complaints = (tmp_path / "stderr").read_text()
+    assert process.returncode == 1, complaints
+    assert "the cyclic process ended with status -9" in complaints
+    assert "Traceback" not in complaints
+    assert output == ""
+    assert len(read_recording(tmp_path / "run.mcap").samples) > 100
+
+
+def test_a_cyclic_process_that_has_lost_its_parent_stops_the_machine_on_the_cam(
+    unhurried: Path, drive_gateway: Start, drives: list[canopen.RemoteNode], bus: can.BusABC, tmp_path: Path
+) -> None:
+    process = start_run(drive_gateway, unhurried, tmp_path)
+    wait_for_motion(bus, process)
+    process.kill()
+    process.communicate(timeout=PATIENCE_S)
+
+    # Ramped down and disabled in good order: no fault.
+    assert [wait_until_disabled(node) for node in drives] == [0x40, 0x40]
+    wait_for_rest(drives)
+    codes = emergencies(bus)
+    # The gateway's heartbeat ends with it; that comes after the disabling.
+    assert {code for node in codes.values() for code in node} <= {0x8130}
+    assert [node.sdo[0x6041].raw & 0x4F for node in drives] == [0x40, 0x40]
+    recording = read_recording(tmp_path / "run.mcap")
+    assert recording.stopped_by == "operator"
