@@ -54,6 +54,11 @@ _FAULT_RESET: Final = int(Controlword.FAULT_RESET)
 _HOMING_START: Final = int(Controlword.HOMING_START)
 _RESUMING: Final = (PowerState.QUICK_STOP_ACTIVE, PowerState.OPERATION_ENABLED)
 _DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
+# Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
+_OPERATION_ENABLED: Final = PowerState.OPERATION_ENABLED
+_HOMING_MODE: Final = Mode.HOMING
+_HOMING_IN_PROGRESS: Final = HomingStatus.IN_PROGRESS
+_NO_CONTROLWORD: Final = -1
 
 
 def wrap_int32(value: int) -> int:
@@ -77,6 +82,10 @@ class _Following(IntEnum):
     NONE = 0
     POSITION = 1
     CAM = 2
+
+
+_POSITION: Final = _Following.POSITION
+_SYNC: Final = SetPointSource.SYNC
 
 
 class Axis:
@@ -106,6 +115,7 @@ class Axis:
         "_home_offset",
         "_homing",
         "_homing_method",
+        "_idle_controlword",
         "_internal_bits",
         "_interpolation_exponent",
         "_interpolation_value",
@@ -201,6 +211,8 @@ class Axis:
 
         self._demand = Demand()
         self._homing = Homing()
+        self._idle_controlword = _NO_CONTROLWORD
+        """The controlword that asks, as the one before it, for nothing new in the present state and mode."""
         self._offset = settings.initial_offset_counts
         self.shaft_counts = 0
         """Resolver counts at the last servo tick."""
@@ -287,6 +299,7 @@ class Axis:
     def restore(self) -> None:
         """Power-on state, from the values that the dictionary holds; the offset of the last homing is lost."""
         self._homing.reset()
+        self._idle_controlword = _NO_CONTROLWORD
         self._offset = self._settings.initial_offset_counts
         self._mode = Mode.NONE
         self._is_guarded = False
@@ -327,7 +340,7 @@ class Axis:
     @property
     def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
         """Torque offset 60B2h, to be added to the controller's torque; 0 unless operation is enabled."""
-        if self._state is not PowerState.OPERATION_ENABLED:
+        if self._state is not _OPERATION_ENABLED:
             return 0.0
         return self._torque_offset.value * 0.001 * self._rated_torque_Nm
 
@@ -357,11 +370,11 @@ class Axis:
             return
         demand = self._demand.at(now_ns)
         self.position_demand_counts = demand
-        if state is PowerState.OPERATION_ENABLED:
+        if state is _OPERATION_ENABLED:
             if self._is_guarded and now_ns - self._set_point_at_ns > self._set_point_timeout_ns:
                 self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
                 return
-            if self._homing.status is HomingStatus.IN_PROGRESS:
+            if self._homing.status is _HOMING_IN_PROGRESS:
                 self._home(shaft_counts)
         elif self._demand.is_over(now_ns):
             if state is PowerState.FAULT_REACTION_ACTIVE:
@@ -370,7 +383,9 @@ class Axis:
             if not self._stops_then_stays:
                 self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
                 return
-        self._guard_following_error(demand - shaft_counts, now_ns)
+        window = self._following_error_window.value
+        if self._following_error_since_ns is not None or not -window <= demand - shaft_counts <= window:
+            self._guard_following_error(demand - shaft_counts, now_ns)
 
     def _guard_following_error(self, error: float, now_ns: int) -> None:
         window = self._following_error_window.value
@@ -400,20 +415,23 @@ class Axis:
             return
         self._sampled_at_ns = now_ns
         position, velocity, torque = self.latch(now_ns)
-        offset = self._offset
-        self._position_actual.value = ((position + offset + _HALF) % _WRAP) - _HALF
-        self._velocity_actual.value = _clamp(floor(velocity + 0.5), _HALF - 1)
-        self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
         demand = floor(self._demand.at(now_ns) + 0.5) if self.is_powered else position
-        self._position_demand.value = ((demand + offset + _HALF) % _WRAP) - _HALF
+        # What is within its type, as it nearly always is, is put there without a call.
+        shown = position + self._offset
+        self._position_actual.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
+        shown = demand + self._offset
+        self._position_demand.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
         error = demand - position
         self._following_error.value = error if -_HALF < error < _HALF else _clamp(error, _HALF - 1)
+        rate = floor(velocity + 0.5)
+        self._velocity_actual.value = rate if -_HALF < rate < _HALF else _clamp(rate, _HALF - 1)
+        self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
 
     def on_sync(self, now_ns: int) -> None:
         """Let the set-points that the synchronous RPDOs have brought act."""
         if self._is_new_target:
             self._is_new_target = False
-            if self._following_mode is _Following.POSITION:
+            if self._following_mode is _POSITION:
                 self._follow_position(self._new_target, now_ns, self._period_s)
                 self._guard(now_ns)
             elif self._following_mode is _Following.CAM:
@@ -427,8 +445,8 @@ class Axis:
     # -- set-points ----------------------------------------------------------------------------------------------
 
     def _on_target(self, value: int, now_ns: int) -> AbortCode | None:
-        if self._following_mode is _Following.POSITION:
-            if self.source is SetPointSource.SYNC:
+        if self._following_mode is _POSITION:
+            if self.source is _SYNC:
                 self._new_target = value
                 self._is_new_target = True
             else:
@@ -444,11 +462,13 @@ class Axis:
             target = low if target < low else high
         if is_limited != bool(self._internal_bits & _LIMITED):
             self._set_internal_bit(_LIMITED, is_limited)
-        self._demand.go_to(self._to_shaft(target, now_ns), now_ns, self._period_s, overrun_s)
+        demand = self._demand
+        start = demand.at(now_ns)
+        demand.go_from(start, self._to_shaft(target, start), now_ns, self._period_s, overrun_s)
 
-    def _to_shaft(self, position: float, now_ns: int) -> float:
-        """The shaft position that shows as ``position`` in the user frame and is nearest to the demand."""
-        reference = floor(self._demand.at(now_ns))
+    def _to_shaft(self, position: float, demand: float) -> float:
+        """The shaft position that shows as ``position`` in the user frame and is nearest to ``demand``."""
+        reference = floor(demand)
         distance = position - self._offset - reference
         return reference + ((distance + _HALF) % _WRAP) - _HALF
 
@@ -474,15 +494,16 @@ class Axis:
         else:
             self._master_counts = master
         slave = table.slave_position(self._master_counts + self._master_offset.value)
-        target = self._to_shaft(slave, now_ns)
+        start = self._demand.at(now_ns)
+        target = self._to_shaft(slave, start)
         if not self._is_cam_engaged:
-            if abs(target - self._demand.at(now_ns)) > self._settings.cam_jump_window_counts:
+            if abs(target - start) > self._settings.cam_jump_window_counts:
                 self.trip(EmergencyCode.CAM_JUMP, _DRIVE_ERROR, now_ns)
                 return
             self._is_cam_engaged = True
             self._after_change()
         is_cyclic = self.source is not SetPointSource.SDO
-        self._demand.go_to(target, now_ns, self._period_s, self._period_s if is_cyclic else 0.0)
+        self._demand.go_from(start, target, now_ns, self._period_s, self._period_s if is_cyclic else 0.0)
         if is_cyclic:
             self._guard(now_ns)
 
@@ -493,6 +514,9 @@ class Axis:
     # -- controlword and state -----------------------------------------------------------------------------------
 
     def _on_controlword(self, value: int, now_ns: int) -> AbortCode | None:
+        if value == self._idle_controlword:
+            return None
+        self._idle_controlword = _NO_CONTROLWORD
         before: int = self._controlword.value
         if value & ~before & _FAULT_RESET and self._state is PowerState.FAULT:
             if not self._emergency.has_persisting_fault:
@@ -504,11 +528,13 @@ class Axis:
         self._execute(command, now_ns)
         if command is PowerCommand.ENABLE_OPERATION and state is PowerState.READY_TO_SWITCH_ON:
             self._execute(command, now_ns)
-        if self._mode is Mode.HOMING and self._state is PowerState.OPERATION_ENABLED:
+        if self._mode is _HOMING_MODE and self._state is _OPERATION_ENABLED:
             status = self._homing.status
             self._homing.command(bool(value & _HOMING_START))
             if self._homing.status is not status:
                 self._after_change()
+        elif value == before and next_state(self._state, command) is self._state:
+            self._idle_controlword = value
         return None
 
     def _execute(self, command: PowerCommand, now_ns: int) -> None:
@@ -536,6 +562,7 @@ class Axis:
         if state is before:
             return
         self._state = state
+        self._idle_controlword = _NO_CONTROLWORD
         self._events.append(PowerStateChanged(now_ns, self._node_id, before, state))
         was_powered = self.is_powered
         self.is_powered = state is PowerState.OPERATION_ENABLED or (
@@ -574,6 +601,7 @@ class Axis:
 
     def _switch_mode(self, now_ns: int) -> None:
         self._mode = MODES[self._mode_entry.value]
+        self._idle_controlword = _NO_CONTROLWORD
         self._homing.interrupt()
         self._internal_bits &= ~_LIMITED
         self._begin_following(now_ns)

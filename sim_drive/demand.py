@@ -49,10 +49,13 @@ class Demand:
 
         The line is kept up for ``overrun_s`` beyond, for the case that the next set-point is late, and held then.
         """
-        position = self.at(now_ns)
+        self.go_from(self.at(now_ns), target, now_ns, period_s, overrun_s)
+
+    def go_from(self, start: float, target: float, now_ns: int, period_s: float, overrun_s: float) -> None:
+        """As ``go_to``, from ``start``, for a caller who knows already where the demand is now."""
         self.start_ns = now_ns
-        self.position = position
-        self.velocity = (target - position) / period_s
+        self.position = start
+        self.velocity = (target - start) / period_s
         self.acceleration = 0.0
         self.duration_s = period_s + overrun_s
 

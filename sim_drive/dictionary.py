@@ -64,9 +64,9 @@ class Entry:
         """Of the kind that ``data_type`` says. Not checked: the cycle reads and writes it at full speed."""
 
     @property
-    def is_plain(self) -> bool:
-        """Whether a new value may be put into ``value`` without asking anyone."""
-        return self.on_write is None and self.low_limit is None and self.high_limit is None
+    def is_unlimited(self) -> bool:
+        """Whether ``store`` asks nobody but the hook before it keeps an integer."""
+        return self.low_limit is None and self.high_limit is None
 
     def store(self, value: Value, now_ns: int) -> AbortCode | None:
         """Check ``value`` against the limits, offer it to the hook, and keep it; the abort code if it was refused."""

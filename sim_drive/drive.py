@@ -41,6 +41,11 @@ _COMMUNICATION_ERRORS: Final = (
 )
 """Errors whose cause ends with a reset, because what noticed them starts anew."""
 
+# Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
+_OPERATIONAL: Final = NmtState.OPERATIONAL
+_SDO: Final = SetPointSource.SDO
+_SYNC: Final = SetPointSource.SYNC
+
 _Handler = Callable[[bytes, int], None]
 
 
@@ -73,8 +78,6 @@ class Drive:
         self.settings: Final = settings
         self.outbox: list[Frame] = []
         self.events: list[Event] = []
-        self.latch: Latch = self._last_tick
-        """Where actual values come from; the machine puts the plant's here."""
         self.dictionary: Final = LiveDictionary(dictionary)
         self.subscriptions_changed = True
         """Set whenever ``cob_ids`` gives something else than before; whoever re-reads it sets it back."""
@@ -82,7 +85,7 @@ class Drive:
         self._emergency = EmergencyProducer(node_id, self.dictionary, self.outbox, self.events)
         self.cam_slots: Final = CamSlots(self.dictionary, decode_cam)
         self.axis: Final = Axis(node_id, self.dictionary, settings, self.cam_slots, self._emergency, self.events)
-        self.axis.latch = lambda now_ns: self.latch(now_ns)
+        self.axis.latch = self._last_tick
         self._sdo = SdoServer(node_id, self.dictionary, self.outbox, round(settings.sdo_timeout_s * _NS_PER_S))
         self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
         self._consumer = HeartbeatConsumer(self.dictionary, self._on_heartbeat_change, self._subscribe)
@@ -168,10 +171,19 @@ class Drive:
 
     # -- what the machine uses -----------------------------------------------------------------------------------
 
+    @property
+    def latch(self) -> Latch:
+        """Where actual values come from; the machine puts the plant's here."""
+        return self.axis.latch
+
+    @latch.setter
+    def latch(self, latch: Latch) -> None:
+        self.axis.latch = latch
+
     def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None:
         """One servo period, with the resolver's counts since power-on."""
         self.axis.on_tick(now_ns, shaft_counts)
-        if self._event_tpdos and self.nmt_state is NmtState.OPERATIONAL:
+        if self._event_tpdos and self.nmt_state is _OPERATIONAL:
             for tpdo in self._event_tpdos:
                 if tpdo.poll(now_ns):
                     self._is_wake_stale = True
@@ -316,7 +328,7 @@ class Drive:
         receive = rpdo.receive
 
         def handle(data: bytes, now_ns: int) -> None:
-            if self.nmt_state is NmtState.OPERATIONAL:
+            if self.nmt_state is _OPERATIONAL:
                 receive(data, now_ns)
 
         return handle
@@ -337,7 +349,7 @@ class Drive:
 
     def _on_sync(self, data: bytes, now_ns: int) -> None:
         """Sample and send first, then let the demands act that came before this SYNC."""
-        if self.nmt_state is not NmtState.OPERATIONAL:
+        if self.nmt_state is not _OPERATIONAL:
             return
         if data:
             self._emergency.raise_error(
@@ -350,14 +362,14 @@ class Drive:
         axis.sample(now_ns)
         for tpdo in self._sync_tpdos:
             tpdo.on_sync(now_ns)
-        axis.source = SetPointSource.SYNC
+        axis.source = _SYNC
         for rpdo in self._sync_rpdos:
             pending = rpdo.pending
             if pending is not None:
                 rpdo.pending = None
                 rpdo.apply(pending, now_ns)
         axis.on_sync(now_ns)
-        axis.source = SetPointSource.SDO
+        axis.source = _SDO
 
     def _on_sync_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
         if value & (_SYNC_GENERATE | _EXTENDED_FRAME) or not value & _COB_ID_MASK:

@@ -42,12 +42,12 @@ class MachineDrive(Protocol):
 
     @property
     def outbox(self) -> list[Frame]:
-        """Frames to send, oldest first; the machine empties it in place."""
+        """Frames to send, oldest first; always the same list, which the machine empties in place."""
         ...
 
     @property
     def events(self) -> list[Event]:
-        """Events, oldest first; the machine empties it in place."""
+        """Events, oldest first; always the same list, which the machine empties in place."""
         ...
 
     @property
@@ -129,6 +129,49 @@ class TickRecord(NamedTuple):
     torques_Nm: tuple[float, ...]
 
 
+class _Motor:
+    """One axis of the machine: its drive, scaling and servo loop, and the resolver at the last servo tick."""
+
+    __slots__ = (
+        "axis",
+        "counts",
+        "counts_per_rad",
+        "drive",
+        "events",
+        "index",
+        "is_powered",
+        "next_wake_ns",
+        "noise",
+        "outbox",
+        "permille_per_Nm",
+        "receive",
+        "servo",
+        "velocity",
+    )
+
+    def __init__(self, index: int, drive: MachineDrive, axis: MachineAxis) -> None:
+        self.index = index
+        self.drive = drive
+        self.axis = axis
+        self.servo = ServoLoop(axis.demand_resolution)
+        self.counts_per_rad = axis.counts_per_revolution / (2.0 * pi)
+        self.permille_per_Nm = 1000.0 / axis.rated_torque_Nm
+        self.noise = 0.0
+        self.counts = 0
+        self.velocity = 0.0
+        """Counts/s, over the last servo period."""
+        self.is_powered = False
+        # Looked up once: they are asked for at every frame and tick.
+        self.receive = drive.receive
+        self.next_wake_ns = drive.next_wake_ns
+        self.outbox = drive.outbox
+        self.events = drive.events
+
+    def quantise(self, angle_rad: float) -> int:
+        """What the resolver shows at this angle."""
+        return floor(angle_rad * self.counts_per_rad + self.noise + 0.5)
+
+
 class EmulatedMachine:
     """Drives and plant as one core (`drivers.node.Node`); drive i moves axis i of the plant.
 
@@ -147,23 +190,18 @@ class EmulatedMachine:
 
     __slots__ = (
         "_brakes",
-        "_counts",
-        "_counts_per_rad",
+        "_due_ns",
         "_events",
         "_frames",
         "_has_tripped",
-        "_is_powered",
+        "_motors",
         "_next_tick_ns",
         "_noise_source",
-        "_noises",
-        "_permille_per_Nm",
         "_routes",
-        "_servos",
         "_start_ns",
         "_tick",
         "_tick_ns",
         "_torques",
-        "_velocities",
         "_wakes",
         "axes",
         "drives",
@@ -193,28 +231,27 @@ class EmulatedMachine:
         self.axes: Final = tuple(axes)
         self.records: Final = deque[TickRecord](maxlen=record_ticks)
         count = len(self.drives)
-        self._counts_per_rad = [axis.counts_per_revolution / (2.0 * pi) for axis in self.axes]
-        self._permille_per_Nm = [1000.0 / axis.rated_torque_Nm for axis in self.axes]
-        self._servos = tuple(ServoLoop(axis.demand_resolution) for axis in self.axes)
+        self._motors: Final = tuple(
+            _Motor(index, drive, axis) for index, (drive, axis) in enumerate(zip(drives, axes, strict=True))
+        )
         self._noise_source = Random(seed)  # noqa: S311 - reproducible on purpose
-        self._noises = [0.0] * count
-        self._counts = [self._quantise(axis, plant.angle(axis)) for axis in range(count)]
-        self._velocities = [0.0] * count
         self._torques = [0.0] * count
         self._brakes = [True] * count
-        self._is_powered = [False] * count
         self._has_tripped = False
         self._start_ns = start_ns
         self._tick = 0
         self._tick_ns = start_ns
         self._next_tick_ns = start_ns + TWO_SERVO_PERIODS_NS // 2
+        self._due_ns = self._next_tick_ns
+        """The next servo tick or the earliest wake of a drive."""
         self._frames: list[Frame] = []
         self._events: list[Event] = []
-        self._routes: dict[int, tuple[int, ...]] = {}
+        self._routes: dict[int, tuple[_Motor, ...]] = {}
         self._wakes = [_NEVER] * count
-        for index, drive in enumerate(self.drives):
-            drive.latch = self._latch_of(index)
-            self._ask_wake(index)
+        for motor in self._motors:
+            motor.counts = motor.quantise(plant.angle(motor.index))
+            motor.drive.latch = self._latch_of(motor)
+            self._ask_wake(motor)
         self._read_subscriptions()
 
     @property
@@ -224,39 +261,33 @@ class EmulatedMachine:
 
     def servo_loop(self, axis: int) -> ServoLoop:
         """The servo loop of an axis, for diagnosis."""
-        return self._servos[axis]
+        return self._motors[axis].servo
 
     def receive(self, frame: Frame, now_ns: int) -> None:
         """Hand a frame of the bus to the drives that listen to it."""
-        if self._next_wake_ns() < now_ns:
+        if self._due_ns < now_ns:
             self.wake(now_ns)
-        indices = self._routes.get(frame.cob_id)
-        if indices is None:
+        listeners = self._routes.get(frame.cob_id)
+        if listeners is None:
             return
-        for index in indices:
-            self.drives[index].receive(frame, now_ns)
-            self._ask_wake(index)
+        for motor in listeners:
+            motor.receive(frame, now_ns)
+            self._ask_wake(motor)
         self._exchange(now_ns)
 
     def next_wake_ns(self) -> int | None:
         """The next servo tick or the next wake of a drive; never None, for the servo ticks never end."""
-        return self._next_wake_ns()
+        return self._due_ns
 
     def wake(self, now_ns: int) -> None:
         """Run every servo tick and every drive's wake that is due, each at its own instant."""
         if now_ns - self._next_tick_ns > MAX_CATCH_UP_NS:
             self._skip_to(now_ns)
-        while True:
-            due_ns = self._next_tick_ns
-            earliest_ns = min(self._wakes)
-            if due_ns <= earliest_ns:
-                if due_ns > now_ns:
-                    return
-                self._run_tick(due_ns)
+        while self._due_ns <= now_ns:
+            if self._due_ns == self._next_tick_ns:
+                self._run_tick(self._due_ns)
             else:
-                if earliest_ns > now_ns:
-                    return
-                self._wake_drive(self._wakes.index(earliest_ns), earliest_ns)
+                self._wake_drive(self._motors[self._wakes.index(self._due_ns)], self._due_ns)
 
     def take_frames(self) -> list[Frame]:
         """Frames of all drives in the order they were sent."""
@@ -272,56 +303,57 @@ class EmulatedMachine:
             self._events = []
         return events
 
-    def _next_wake_ns(self) -> int:
-        earliest_ns = min(self._wakes)
-        return earliest_ns if earliest_ns < self._next_tick_ns else self._next_tick_ns
+    def _ask_wake(self, motor: _Motor) -> None:
+        wake_ns = motor.next_wake_ns()
+        if wake_ns is None:
+            wake_ns = _NEVER
+        if wake_ns != self._wakes[motor.index]:
+            self._set_wake(motor, wake_ns)
 
-    def _ask_wake(self, index: int) -> None:
-        wake_ns = self.drives[index].next_wake_ns()
-        self._wakes[index] = _NEVER if wake_ns is None else wake_ns
+    def _set_wake(self, motor: _Motor, wake_ns: int) -> None:
+        self._wakes[motor.index] = wake_ns
+        self._due_ns = min(self._next_tick_ns, *self._wakes)
 
-    def _wake_drive(self, index: int, due_ns: int) -> None:
+    def _wake_drive(self, motor: _Motor, due_ns: int) -> None:
         # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
         at_ns = due_ns if due_ns > self._tick_ns else self._tick_ns
-        drive = self.drives[index]
         for _ in range(_MAX_WAKES_PER_INSTANT):
-            drive.wake(at_ns)
-            self._ask_wake(index)
-            if self._wakes[index] > at_ns:
+            motor.drive.wake(at_ns)
+            self._ask_wake(motor)
+            if self._wakes[motor.index] > at_ns:
                 break
         else:
             # A drive that always wants more at one instant must not stop the others: it goes on at the next tick.
-            self._wakes[index] = self._next_tick_ns
+            self._set_wake(motor, self._next_tick_ns)
         self._exchange(at_ns)
 
     def _run_tick(self, now_ns: int) -> None:
         plant = self.plant
-        plant.advance(self._torques, self._brakes)
+        torques = self._torques
+        brakes = self._brakes
+        plant.advance(torques, brakes)
         self._tick += 1
         self._tick_ns = now_ns
         self._next_tick_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
+        self._due_ns = min(self._next_tick_ns, *self._wakes)
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
-        for index, drive in enumerate(self.drives):
-            axis = self.axes[index]
+        for motor in self._motors:
+            index = motor.index
+            drive = motor.drive
+            axis = motor.axis
             if axis.resolver_noise_counts > 0.0:
-                self._noises[index] = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
-            counts = self._quantise(index, plant.angle(index))
-            velocity = float((counts - self._counts[index]) * SERVO_RATE_HZ)
-            self._counts[index] = counts
-            self._velocities[index] = velocity
+                motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
+            counts = floor(plant.angle(index) * motor.counts_per_rad + motor.noise + 0.5)
+            motor.velocity = velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
+            motor.counts = counts
             drive.on_servo_tick(now_ns, counts, velocity)
-            self._brakes[index] = not drive.brake_released
+            brakes[index] = not drive.brake_released
             if drive.is_powered:
-                servo = self._servos[index]
                 demand = drive.position_demand_counts
-                if not self._is_powered[index]:
-                    servo.reset(demand, counts)
-                    self._is_powered[index] = True
-                    if self._has_tripped:
-                        # Neither a fault reset nor switching the drive off and on mends a torn linkage.
-                        drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
-                self._torques[index] = servo.update(
+                if not motor.is_powered:
+                    self._power_on(motor, demand, now_ns)
+                torques[index] = motor.servo.update(
                     demand,
                     counts,
                     drive.gains,
@@ -330,60 +362,72 @@ class EmulatedMachine:
                     drive.torque_limit_Nm,
                 )
             else:
-                self._is_powered[index] = False
-                self._torques[index] = 0.0
-            self._ask_wake(index)
+                motor.is_powered = False
+                torques[index] = 0.0
+            self._ask_wake(motor)
         if self.records.maxlen:
             self._record(now_ns)
         self._exchange(now_ns)
+
+    def _power_on(self, motor: _Motor, demand_counts: float, now_ns: int) -> None:
+        """The drive has switched its amplifier on since the tick before."""
+        motor.is_powered = True
+        motor.servo.reset(demand_counts, motor.counts)
+        if self._has_tripped:
+            # Neither a fault reset nor switching the drive off and on mends a torn linkage.
+            motor.drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
     def _exchange(self, now_ns: int) -> None:
         """Collect what the drives have sent and noticed, and let them hear each other."""
         for _ in range(_MAX_CROSS_ROUNDS):
             is_quiet = True
-            for index, drive in enumerate(self.drives):
-                if drive.subscriptions_changed:
+            for motor in self._motors:
+                if motor.drive.subscriptions_changed:
                     self._read_subscriptions()
-                if drive.events:
-                    self._events.extend(drive.events)
-                    drive.events.clear()
-                if drive.outbox:
-                    is_quiet = False
-                    frames = tuple(drive.outbox)
-                    drive.outbox.clear()
-                    self._frames.extend(frames)
+                if motor.events:
+                    self._events += motor.events
+                    motor.events.clear()
+                if motor.outbox:
+                    frames = motor.outbox.copy()
+                    motor.outbox.clear()
+                    self._frames += frames
                     for frame in frames:
-                        self._tell_others(index, frame, now_ns)
+                        if frame.cob_id in self._routes:
+                            is_quiet = False
+                            self._tell_others(motor, frame, now_ns)
             # Drives that answer each other without end go on at the next tick: on a wire it would cost them time too.
             if is_quiet:
                 return
 
-    def _tell_others(self, sender: int, frame: Frame, now_ns: int) -> None:
-        for index in self._routes.get(frame.cob_id, ()):
-            if index != sender:
-                self.drives[index].receive(frame, now_ns)
-                self._ask_wake(index)
+    def _tell_others(self, sender: _Motor, frame: Frame, now_ns: int) -> None:
+        for motor in self._routes[frame.cob_id]:
+            if motor is not sender:
+                motor.receive(frame, now_ns)
+                self._ask_wake(motor)
 
     def _read_subscriptions(self) -> None:
-        routes: dict[int, tuple[int, ...]] = {}
-        for index, drive in enumerate(self.drives):
-            drive.subscriptions_changed = False
-            for cob_id in sorted(drive.cob_ids()):
-                routes[cob_id] = (*routes.get(cob_id, ()), index)
+        routes: dict[int, tuple[_Motor, ...]] = {}
+        for motor in self._motors:
+            motor.drive.subscriptions_changed = False
+            for cob_id in sorted(motor.drive.cob_ids()):
+                routes[cob_id] = (*routes.get(cob_id, ()), motor)
         self._routes = routes
 
-    def _quantise(self, axis: int, angle_rad: float) -> int:
-        return floor(angle_rad * self._counts_per_rad[axis] + self._noises[axis] + 0.5)
-
-    def _latch_of(self, axis: int) -> Latch:
-        plant = self.plant
+    def _latch_of(self, motor: _Motor) -> Latch:
+        index = motor.index
+        angle = self.plant.angle
+        torque = self.plant.torque
 
         def latch(now_ns: int) -> tuple[int, float, int]:
-            offset_s = min(max((now_ns - self._tick_ns) * 1e-9, 0.0), SERVO_PERIOD_S)
+            offset_s = (now_ns - self._tick_ns) * 1e-9
+            if offset_s < 0.0:
+                offset_s = 0.0
+            elif offset_s > SERVO_PERIOD_S:
+                offset_s = SERVO_PERIOD_S
             return (
-                self._quantise(axis, plant.angle(axis, offset_s)),
-                self._velocities[axis],
-                floor(plant.torque(axis) * self._permille_per_Nm[axis] + 0.5),
+                floor(angle(index, offset_s) * motor.counts_per_rad + motor.noise + 0.5),
+                motor.velocity,
+                floor(torque(index) * motor.permille_per_Nm + 0.5),
             )
 
         return latch
@@ -406,6 +450,7 @@ class EmulatedMachine:
         self._next_tick_ns = self._start_ns + tick * TWO_SERVO_PERIODS_NS // 2
         # Wakes missed meanwhile are due once, now, not once for every period they have missed.
         self._wakes = [max(wake_ns, self._next_tick_ns) for wake_ns in self._wakes]
+        self._due_ns = self._next_tick_ns
 
     def _record(self, now_ns: int) -> None:
         axes = range(len(self.drives))
@@ -413,7 +458,7 @@ class EmulatedMachine:
             TickRecord(
                 now_ns,
                 tuple(self.plant.angle(axis) for axis in axes),
-                tuple(self._counts),
+                tuple(motor.counts for motor in self._motors),
                 tuple(drive.position_demand_counts for drive in self.drives),
                 tuple(self._torques),
                 tuple(self.plant.torque(axis) for axis in axes),

@@ -7,6 +7,7 @@ left for the SYNC is one pack or unpack for each PDO.
 import struct
 from collections.abc import Callable, Sequence
 from enum import IntEnum, unique
+from operator import attrgetter
 from typing import Any, Final, Protocol
 
 from drivers import objects
@@ -15,7 +16,7 @@ from drivers.object_dictionary import FORMAT
 from drivers.pdo import PDO_COB_ID_INVALID, PDO_MAX_ENTRIES, MappingEntry
 from drivers.sdo import AbortCode
 from sim_drive.axis import Axis, SetPointSource
-from sim_drive.dictionary import Entry, LiveDictionary
+from sim_drive.dictionary import Entry, LiveDictionary, WriteHook
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 
 LAST_SYNCHRONOUS_TYPE: Final = 240
@@ -26,6 +27,9 @@ _COB_ID_MASK: Final = 0x7FF
 _EXTENDED_FRAME: Final = 1 << 29
 _INHIBIT_UNIT_NS: Final = 100_000
 _NS_PER_MS: Final = 1_000_000
+
+_value_of: Final = attrgetter("value")
+"""Of a dictionary's entry."""
 
 _MEASURED: Final = frozenset(
     {
@@ -127,6 +131,7 @@ class _Pdo:
         "entries",
         "is_valid",
         "length",
+        "transmission_type",
         "type_entry",
     )
 
@@ -139,6 +144,8 @@ class _Pdo:
         self.cob_id_entry = dictionary.entry(communication, _Sub.COB_ID)
         self.type_entry = dictionary.entry(communication, _Sub.TRANSMISSION_TYPE)
         self._mapping = [dictionary.entry(mapping, n) for n in range(PDO_MAX_ENTRIES + 1)]
+        self.transmission_type = 0
+        """As CiA 301, table 72."""
         self.cob_id = 0
         self.is_valid = False
         self.entries: tuple[Entry, ...] = ()
@@ -148,11 +155,6 @@ class _Pdo:
         self._mapping[0].on_write = self._on_count
         for entry in self._mapping[1:]:
             entry.on_write = self._on_entry
-
-    @property
-    def transmission_type(self) -> int:
-        """As CiA 301, table 72."""
-        return self.type_entry.value
 
     def restore(self, now_ns: int) -> None:
         """Take over what the dictionary holds."""
@@ -165,6 +167,10 @@ class _Pdo:
         if self.is_valid and not isinstance(mapped, AbortCode):
             self.entries, self.length, codec = compile_mapping(mapped)
             self._take_codec(codec)
+        self._restart(now_ns)
+
+    def _restart(self, now_ns: int) -> None:
+        self.transmission_type = self.type_entry.value
         self._start(now_ns)
 
     def _take_codec(self, codec: _Codec) -> None:
@@ -219,7 +225,7 @@ class _Pdo:
         if value > LAST_SYNCHRONOUS_TYPE and value not in EVENT_DRIVEN_TYPES:
             return AbortCode.VALUE_RANGE_EXCEEDED
         self.type_entry.value = value
-        self._start(now_ns)
+        self._restart(now_ns)
         self._on_change(now_ns)
         return None
 
@@ -271,14 +277,14 @@ class ReceivePdo(_Pdo):
         self._axis = axis
         self._emergency = emergency
         self._unpack: Callable[[bytes], tuple[Any, ...]] = _unpack_nothing
-        self._steps: tuple[tuple[Entry, bool], ...] = ()
+        self._steps: tuple[tuple[Entry, WriteHook | None, bool], ...] = ()
         self.is_synchronous = False
         self.pending: bytes | None = None
         """Data that wait for the next SYNC."""
 
     def _take_codec(self, codec: _Codec) -> None:
         self._unpack = codec.unpack_from
-        self._steps = tuple((entry, entry.is_plain) for entry in self.entries)
+        self._steps = tuple((entry, entry.on_write, entry.is_unlimited) for entry in self.entries)
 
     def _start(self, now_ns: int) -> None:
         self.pending = None
@@ -306,11 +312,11 @@ class ReceivePdo(_Pdo):
 
     def apply(self, data: bytes, now_ns: int) -> None:
         """Write the mapped objects, in the order of the mapping; what its object refuses is left as it was."""
-        for (entry, is_plain), value in zip(self._steps, self._unpack(data), strict=True):
-            if is_plain:
-                entry.value = value
-            else:
+        for (entry, on_write, is_unlimited), value in zip(self._steps, self._unpack(data)):  # noqa: B905 - as mapped
+            if not is_unlimited:
                 entry.store(value, now_ns)
+            elif on_write is None or on_write(value, now_ns) is None:
+                entry.value = value
 
 
 class TransmitPdo(_Pdo):
@@ -382,13 +388,13 @@ class TransmitPdo(_Pdo):
 
     def send(self, now_ns: int) -> None:
         """Send the PDO with the values as they are."""
-        self._outbox.append(Frame(self.cob_id, self._pack(*[entry.value for entry in self.entries])))
+        self._outbox.append(Frame(self.cob_id, self._pack(*map(_value_of, self.entries))))
 
     def on_sync(self, now_ns: int) -> None:
         """Send at this SYNC if its transmission type says so: 0 after an event, n at every n-th."""
         transmission_type = self.transmission_type
         if transmission_type == 1:
-            self._outbox.append(Frame(self.cob_id, self._pack(*[entry.value for entry in self.entries])))
+            self._outbox.append(Frame(self.cob_id, self._pack(*map(_value_of, self.entries))))
         elif transmission_type == 0:
             if self._has_changed():
                 self.send(now_ns)
@@ -426,7 +432,7 @@ class TransmitPdo(_Pdo):
             self.due_ns = None
 
     def _has_changed(self) -> bool:
-        sources = [entry.value for entry in self._sources]
+        sources = list(map(_value_of, self._sources))
         if sources == self._last_sources:
             return False
         self._last_sources = sources
