@@ -190,16 +190,6 @@ def test_a_mapping_that_cannot_be_is_aborted(node: BaseNode402) -> None:
     mapping[0].raw = 2
 
 
-def test_block_transfers_are_refused_by_their_command(node: BaseNode402) -> None:
-    with pytest.raises(SdoAbortedError) as refused:
-        node.sdo.open(0x1008, 0, "rb", block_transfer=True)
-    assert refused.value.code == 0x05040001
-    with pytest.raises(SdoAbortedError) as refused:
-        node.sdo.open(0x3000, 1, "wb", size=100, block_transfer=True)
-    assert refused.value.code == 0x05040001
-    assert node.sdo.upload(0x1008, 0) == b"sim-drive"
-
-
 @pytest.mark.parametrize("size", [1, 4, 5, 7, 8, 889, 4116])
 def test_a_profile_slot_takes_bytes_of_any_length(node: BaseNode402, size: int) -> None:
     image = bytes((7 * n + size) % 251 for n in range(size))

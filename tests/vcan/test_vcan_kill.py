@@ -1,6 +1,7 @@
 """A gateway killed in motion stops the machine: by the drives' own guard, or by what is left of the gateway."""
 
 import os
+import select
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -138,6 +139,7 @@ def test_a_cyclic_process_that_has_lost_its_parent_stops_the_machine_on_the_cam(
 ) -> None:
     process = start_run(drive_gateway, unhurried, tmp_path)
     wait_for_motion(bus, process)
+    recorder = os.pidfd_open(child_of(process, "gateway.recorder"))
     process.kill()
     process.communicate(timeout=PATIENCE_S)
 
@@ -148,5 +150,9 @@ def test_a_cyclic_process_that_has_lost_its_parent_stops_the_machine_on_the_cam(
     # The gateway's heartbeat ends with it; that comes after the disabling.
     assert {code for node in codes.values() for code in node} <= {0x8130}
     assert [node.sdo[0x6041].raw & 0x4F for node in drives] == [0x40, 0x40]
+    # The recorder has outlived its parent too, until it had everything.
+    assert select.select([recorder], [], [], PATIENCE_S)[0]
+    os.close(recorder)
     recording = read_recording(tmp_path / "run.mcap")
+    assert recording.is_complete
     assert recording.stopped_by == "operator"
