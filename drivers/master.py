@@ -6,6 +6,7 @@ reads from top to bottom, and runs in virtual time and in real time alike.
 """
 
 import struct
+from collections import deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Final, TypeVar
@@ -16,7 +17,18 @@ from drivers.nmt import EMCY_BASE, HEARTBEAT_BASE, NMT_COB_ID, NmtCommand, NmtSt
 from drivers.node import Event
 from drivers.object_dictionary import DataType, Value, decode, encode
 from drivers.sdo import SDO_REQUEST_BASE, SDO_RESPONSE_BASE, AbortCode, abort_text
-from drivers.sdo_client import SdoTransferError, abort_payload, download, upload
+from drivers.sdo_block import MAX_BLOCK_SIZE
+from drivers.sdo_client import (
+    SdoTimeoutError,
+    SdoTransferError,
+    Transfer,
+    Wait,
+    abort_payload,
+    download,
+    download_block,
+    upload,
+    upload_block,
+)
 
 T = TypeVar("T")
 Procedure = Generator[int, None, T]
@@ -24,6 +36,9 @@ Procedure = Generator[int, None, T]
 
 DEFAULT_SDO_TIMEOUT_S: Final = 0.5
 NS_PER_S: Final = 1_000_000_000
+_RESPONSES_KEPT: Final = 2 * MAX_BLOCK_SIZE
+_QUIET_S: Final = 0.02
+"""After a client's abort: how long a server must have been silent for the rest of its sub-block to be over."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +85,7 @@ class RemoteNode:
         "is_lost",
         "last_emergency",
         "node_id",
-        "response",
+        "responses",
         "state",
     )
 
@@ -84,7 +99,8 @@ class RemoteNode:
         self.is_lost = False
         self.emergencies = 0
         self.last_emergency: EmergencyReceived | None = None
-        self.response: bytes | None = None
+        self.responses: deque[bytes] = deque(maxlen=_RESPONSES_KEPT)
+        """SDO responses that no transfer has taken yet."""
 
 
 class Master:
@@ -112,7 +128,7 @@ class Master:
             return
         service = frame.cob_id & 0x780
         if service == SDO_RESPONSE_BASE:
-            node.response = frame.data
+            node.responses.append(frame.data)
         elif service == HEARTBEAT_BASE:
             self._take_heartbeat(node, frame.data)
         elif service == EMCY_BASE and len(frame.data) == 8:
@@ -193,27 +209,44 @@ class Master:
         yield from self.wait_for(lambda: False, span_s)
 
     def _transfer(
-        self, node_id: int, index: int, subindex: int, exchange: Generator[bytes, bytes, T], timeout_s: float
+        self, node_id: int, index: int, subindex: int, exchange: Transfer[T], timeout_s: float
     ) -> Procedure[T]:
-        node = self.nodes[node_id]
         cob_id = SDO_REQUEST_BASE + node_id
+        responses = self.nodes[node_id].responses
+        is_block_transfer = False
         try:
             request = next(exchange)
             while True:
-                node.response = None
-                self.outbox.append(Frame(cob_id, request))
-                answered = yield from self.wait_for(lambda: node.response is not None, timeout_s)
-                if not answered or node.response is None:
-                    abort = abort_payload(index, subindex, AbortCode.PROTOCOL_TIMED_OUT)
-                    self.outbox.append(Frame(cob_id, abort))
-                    raise NoAnswerError(node_id, f"SDO {index:04X}h:{subindex:02X}", timeout_s)
-                request = exchange.send(node.response)
+                payloads, wait = ((request,), Wait.RESPONSE) if isinstance(request, bytes) else request
+                if payloads:
+                    responses.clear()
+                    self.outbox += [Frame(cob_id, payload) for payload in payloads]
+                if wait is Wait.NOTHING:
+                    request = next(exchange)
+                    continue
+                is_block_transfer = is_block_transfer or not isinstance(request, bytes)
+                # A pause between responses is a lost one long before the server gives up waiting for us.
+                patience_s = timeout_s / 2 if wait is Wait.MORE else timeout_s
+                yield from self.wait_for(lambda: bool(responses), patience_s)
+                request = exchange.send(responses.popleft()) if responses else exchange.throw(SdoTimeoutError())
         except StopIteration as done:
             return done.value
+        except SdoTimeoutError:
+            self.outbox.append(Frame(cob_id, abort_payload(index, subindex, AbortCode.PROTOCOL_TIMED_OUT)))
+            raise NoAnswerError(node_id, f"SDO {index:04X}h:{subindex:02X}", timeout_s) from None
         except SdoTransferError as failure:
             if not failure.is_by_server:
                 self.outbox.append(Frame(cob_id, abort_payload(index, subindex, failure.code)))
+                if is_block_transfer:
+                    yield from self._let_pass(responses)
             raise SdoAbortedError(node_id, index, subindex, failure.code, abort_text(failure.code)) from None
+
+    def _let_pass(self, responses: deque[bytes]) -> Procedure[None]:
+        """Wait for the end of a sub-block that nobody wants any more, so that it is no answer to what comes next."""
+        for _ in range(_RESPONSES_KEPT):
+            responses.clear()
+            if not (yield from self.wait_for(lambda: bool(responses), _QUIET_S)):
+                return
 
     def upload(
         self, node_id: int, index: int, subindex: int, timeout_s: float = DEFAULT_SDO_TIMEOUT_S
@@ -226,6 +259,31 @@ class Master:
     ) -> Procedure[None]:
         """Write an object's bytes. Raises SdoAbortedError or NoAnswerError."""
         return self._transfer(node_id, index, subindex, download(index, subindex, data), timeout_s)
+
+    def upload_block(
+        self,
+        node_id: int,
+        index: int,
+        subindex: int,
+        timeout_s: float = DEFAULT_SDO_TIMEOUT_S,
+        block_size: int = MAX_BLOCK_SIZE,
+        protocol_switch_threshold: int = 0,
+    ) -> Procedure[bytes]:
+        """Read an object's bytes by block transfer (see ``sdo_client.upload_block``), segmented if the node has none.
+
+        Raises SdoAbortedError or NoAnswerError.
+        """
+        exchange = upload_block(index, subindex, block_size, protocol_switch_threshold)
+        return self._transfer(node_id, index, subindex, exchange, timeout_s)
+
+    def download_block(
+        self, node_id: int, index: int, subindex: int, data: bytes, timeout_s: float = DEFAULT_SDO_TIMEOUT_S
+    ) -> Procedure[None]:
+        """Write an object's bytes by block transfer, segmented if the node has none.
+
+        Raises SdoAbortedError or NoAnswerError.
+        """
+        return self._transfer(node_id, index, subindex, download_block(index, subindex, data), timeout_s)
 
     def read(self, node_id: int, index: int, subindex: int, data_type: DataType) -> Procedure[Value]:
         """Read a typed object; a length that is not the type's is answered with an SdoAbortedError."""

@@ -86,7 +86,8 @@ class Drive:
         self.cam_slots: Final = CamSlots(self.dictionary, decode_cam)
         self.axis: Final = Axis(node_id, self.dictionary, settings, self.cam_slots, self._emergency, self.events)
         self.axis.latch = self._last_tick
-        self._sdo = SdoServer(node_id, self.dictionary, self.outbox, round(settings.sdo_timeout_s * _NS_PER_S))
+        sdo_timeout_ns = round(settings.sdo_timeout_s * _NS_PER_S)
+        self._sdo = SdoServer(node_id, self.dictionary, self.outbox, sdo_timeout_ns, settings.sdo_block_size)
         self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
         self._consumer = HeartbeatConsumer(self.dictionary, self._on_heartbeat_change, self._subscribe)
         self._rpdos = [

@@ -30,6 +30,8 @@ class DriveSettings:
     cam_jump_window_counts: int = 64
     """How far the cam's demand may be from the axis when it is engaged."""
     sdo_timeout_s: float = 1.0
-    """How long a client may pause within a segmented transfer."""
+    """How long a client may pause within a segmented or block transfer."""
+    sdo_block_size: int = 127
+    """Segments in a sub-block of a block download, 1 to 127."""
     boot_up_delay_s: float = 0.0
     """From power-on or a reset to the boot-up message."""
