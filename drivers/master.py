@@ -115,6 +115,8 @@ class Master:
         self._heartbeat = Frame(HEARTBEAT_BASE + own_node_id, bytes((NmtState.OPERATIONAL,)))
         self._heartbeat_period_ns = heartbeat_period_ns
         self._heartbeat_due_ns = 0
+        self._due_ns: int | None = None
+        self._find_due()
 
     # -- the seam ------------------------------------------------------------------------------------------------
 
@@ -146,6 +148,7 @@ class Master:
             return
         node.heartbeat_at_ns = self.now_ns
         node.is_lost = False
+        self._find_due()
         if state is NmtState.BOOT_UP:
             node.boot_ups += 1
             node.state = NmtState.PRE_OPERATIONAL
@@ -156,13 +159,16 @@ class Master:
 
     def next_wake_ns(self) -> int | None:
         """The next heartbeat of our own, or the next one to be missed of a node's."""
+        return self._due_ns
+
+    def _find_due(self) -> None:
         due = self._heartbeat_due_ns if self._heartbeat_period_ns else None
         for node in self.nodes.values():
             if node.heartbeat_timeout_ns and not node.is_lost:
                 missed_at = node.heartbeat_at_ns + node.heartbeat_timeout_ns
                 if due is None or missed_at < due:
                     due = missed_at
-        return due
+        self._due_ns = due
 
     def wake(self, now_ns: int) -> None:
         """Send our heartbeat and look for lost ones where due."""
@@ -179,6 +185,7 @@ class Master:
             ):
                 node.is_lost = True
                 self.events.append(HeartbeatLost(now_ns, node.node_id, node.heartbeat_timeout_ns / NS_PER_S))
+        self._find_due()
 
     # -- commands ------------------------------------------------------------------------------------------------
 
@@ -192,6 +199,7 @@ class Master:
         node.heartbeat_timeout_ns = round(timeout_s * NS_PER_S)
         node.heartbeat_at_ns = self.now_ns
         node.is_lost = False
+        self._find_due()
 
     # -- procedures ----------------------------------------------------------------------------------------------
 

@@ -101,6 +101,7 @@ class VirtualBus:
         """When each node wants to be woken; the last entry stands there for a bus without nodes."""
         self._earliest_wake_ns = _NEVER
         self._queues: Final = tuple(deque[Frame]() for _ in self.nodes)
+        self._numbered_queues: Final = tuple(enumerate(self._queues))
         self._on_wire: Frame | None = None
         self._sender = 0
         self._frame_end_ns = _NEVER
@@ -156,20 +157,22 @@ class VirtualBus:
         """
         return self._run(limit_ns, condition)
 
-    def _run(self, limit_ns: int, condition: Callable[[], bool] | None) -> bool:
+    def _run(self, limit_ns: int, condition: Callable[[], bool] | None) -> bool:  # noqa: C901 - one loop, for speed
         if limit_ns < self._now_ns:
             raise ValueError(f"time cannot run back from {self._now_ns} ns to {limit_ns} ns")
         self.refresh()
         late = self._late
+        queues = self._numbered_queues
+        wire_ns = self._wire_ns
         is_arbitration_due = self._on_wire is None and any(self._queues)
         while condition is None or condition():
             if is_arbitration_due:
                 is_arbitration_due = False
                 now_ns = self._now_ns
             else:
-                now_ns = self._frame_end_ns
-                if self._earliest_wake_ns < now_ns:
-                    now_ns = self._earliest_wake_ns
+                now_ns = self._earliest_wake_ns
+                if self._frame_end_ns < now_ns:
+                    now_ns = self._frame_end_ns
                 if late and late[0][0] < now_ns:
                     now_ns = late[0][0]
                 if now_ns < self._now_ns:
@@ -186,24 +189,18 @@ class VirtualBus:
             if self._earliest_wake_ns <= now_ns:
                 self._wake_due(now_ns)
             if self._on_wire is None:
-                self._arbitrate(now_ns)
+                # Arbitration: the lowest COB-ID among the oldest waiting frames wins, a data frame before a remote one.
+                best = _NEVER
+                for sender, queue in queues:
+                    if queue:
+                        cob_id, _, is_remote = queue[0]
+                        if cob_id * 2 + is_remote < best:
+                            best = cob_id * 2 + is_remote
+                            self._sender = sender
+                if best != _NEVER:
+                    self._on_wire = frame = self._queues[self._sender].popleft()
+                    self._frame_end_ns = now_ns + wire_ns[len(frame.data)]
         return True
-
-    def _arbitrate(self, now_ns: int) -> None:
-        """Put the frame of the highest priority on the wire, if there is one."""
-        best = _NEVER
-        winner = -1
-        for index, queue in enumerate(self._queues):
-            if queue:
-                frame = queue[0]
-                priority = frame.cob_id * 2 + frame.is_remote
-                if priority < best:
-                    best = priority
-                    winner = index
-        if winner >= 0:
-            self._on_wire = frame = self._queues[winner].popleft()
-            self._sender = winner
-            self._frame_end_ns = now_ns + self._wire_ns[len(frame.data)]
 
     def _end_frame(self, now_ns: int) -> None:
         """Take the frame off the wire and deliver it, or do with it what the faults say."""
@@ -214,10 +211,10 @@ class VirtualBus:
         self._frame_end_ns = _NEVER
         self._busy_ns += self._wire_ns[len(frame.data)]
         self._frame_count += 1
-        if self._faults is None:
-            self._deliver(self._sender, frame, now_ns)
-            return
         sender = self._sender
+        if self._faults is None:
+            self._deliver(sender, frame, now_ns)
+            return
         for delay_ns in self._faults.delays_ns(sender, frame, now_ns, self._source):
             if delay_ns <= 0:
                 self._deliver(sender, frame, now_ns)

@@ -98,9 +98,10 @@ class GatewayCore:
 
     def receive(self, frame: Frame, now_ns: int) -> None:
         """Take a frame: a TPDO goes to the cycle, everything else to the master."""
-        number = self.loop.tpdo_slots.get(frame.cob_id)
+        loop = self.loop
+        number = loop.tpdo_slots.get(frame.cob_id)
         if number is not None:
-            if self.loop.is_running and not frame.is_remote and self.loop.receive_tpdo(number, frame.data, now_ns):
+            if loop.is_running and not frame.is_remote and loop.receive_tpdo(number, frame.data, now_ns):
                 self._resume(now_ns)
             return
         self.master.receive(frame, now_ns)
@@ -111,13 +112,14 @@ class GatewayCore:
         """The earliest of cycle, heartbeats and the session's own time-out; None when the session is over."""
         if self.is_done:
             return None
-        due = self.master.next_wake_ns()
+        due = self._resume_at_ns
+        heartbeat_due = self.master.next_wake_ns()
+        if due is None or (heartbeat_due is not None and heartbeat_due < due):
+            due = heartbeat_due
         if self.loop.is_running:
             cycle_due = self.loop.next_wake_ns()
             if due is None or cycle_due < due:
-                due = cycle_due
-        if self._resume_at_ns is not None and (due is None or self._resume_at_ns < due):
-            due = self._resume_at_ns
+                return cycle_due
         return due
 
     def wake(self, now_ns: int) -> None:
@@ -200,8 +202,9 @@ class GatewayCore:
         except StopIteration:
             self.is_done = True
             self._resume_at_ns = None
-        self._events += self.master.events
-        self.master.events = []
+        if self.master.events:
+            self._events += self.master.events
+            self.master.events = []
 
     def _step(self, name: str) -> None:
         self._events.append(StepReached(self.master.now_ns, name))

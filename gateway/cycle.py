@@ -9,6 +9,7 @@ value latched at SYNC(k): both belong to the same instant.
 """
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Final, Protocol
 
 from config.schema import Reaction
@@ -19,7 +20,7 @@ from drivers.object_dictionary import DataType
 from drivers.pdo import RPDO_BASE, TPDO_BASE, PdoLayout
 from gateway.demand import Demand
 from gateway.guard import Condition, Guard, StopReason
-from gateway.sample import Phase, SampleFlag, saturate_int32
+from gateway.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
 from gateway.units import AxisUnits
 
 RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
@@ -32,6 +33,17 @@ TPDO_DEADLINE: Final = 0.8
 """Share of the cycle after which a TPDO counts as missed and the demand is sent without it."""
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
+
+
+# Looked up once: the cycle needs them a thousand times a second and more.
+_actual_of: Final = attrgetter("actual")
+_statusword_of: Final = attrgetter("statusword")
+_torque_of: Final = attrgetter("torque")
+_target_of: Final = attrgetter("target")
+_unpack_tpdo: Final = TPDO_LAYOUT.unpack_from
+_pack_rpdo: Final = RPDO_LAYOUT.pack
+_TPDO_LENGTH: Final = TPDO_LAYOUT.length
+_COMMISSIONING: Final = Phase.COMMISSIONING
 
 
 class SampleSink(Protocol):
@@ -73,6 +85,10 @@ class AxisChannel:
         self.statusword = 0
         self.actual = 0
         self.torque = 0
+
+
+_Sent = tuple[float, float, list[float], list[int], list[int], Phase]
+"""A demand: master position, master velocity, velocities, targets, torque offsets, phase. Its lists are not changed."""
 
 
 class CyclicLoop:
@@ -120,10 +136,13 @@ class CyclicLoop:
         self._arrival_ns = 0
         self._sent_ns = 0
         self._flags = 0
-        nothing = (0.0, 0.0, [0.0] * len(axes), [0] * len(axes), [0] * len(axes), int(Phase.COMMISSIONING))
-        self._in_force = self._applied = self._sent = nothing
-        """Demands by age: reached at the last SYNC, applied at the last SYNC, sent last. Each is (master position,
-        master velocity, velocities, targets, torque offsets, phase)."""
+        self._no_velocities = [0.0] * len(axes)
+        self._no_torque_offsets = [0] * len(axes)
+        nothing = (0.0, 0.0, self._no_velocities, [0] * len(axes), self._no_torque_offsets, _COMMISSIONING)
+        self._in_force: _Sent = nothing
+        self._applied: _Sent = nothing
+        self._sent: _Sent = nothing
+        """Demands by age: reached at the last SYNC, applied at the last SYNC, sent last."""
 
     # -- commands ------------------------------------------------------------------------------------------------
 
@@ -177,10 +196,10 @@ class CyclicLoop:
 
     def receive_tpdo(self, number: int, data: bytes, now_ns: int) -> bool:
         """Take the TPDO of axis ``number``; returns whether it closed the cycle."""
-        if len(data) != TPDO_LAYOUT.length:
+        if len(data) != _TPDO_LENGTH:
             return False
         axis = self.axes[number]
-        axis.statusword, axis.actual, axis.torque = TPDO_LAYOUT.unpack_from(data)
+        axis.statusword, axis.actual, axis.torque = _unpack_tpdo(data)
         self._awaited &= ~(1 << number)
         if self._awaited or self._is_closed:
             return False
@@ -221,58 +240,57 @@ class CyclicLoop:
         self.actuals_are_valid = not self._awaited
         self._in_force = self._applied
         self._applied = self._sent
-        if self.phase is not Phase.COMMISSIONING:
+        if self.phase is not _COMMISSIONING:
             self._check(now_ns)
         demand = self._demand
-        axes = self.axes
-        outbox = self.outbox
         if demand is None:
-            for axis in axes:
+            for axis in self.axes:
                 # A drive that holds torque keeps its target: one that follows the actual position has no stiffness.
                 if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
                     axis.target = axis.actual
-                axis.torque_offset = 0
-            targets = [axis.target for axis in axes]
-            zeros = [0] * len(axes)
-            self._sent = (self._sent[0], 0.0, [0.0] * len(axes), targets, zeros, int(self.phase))
+            nothing = self._no_torque_offsets
+            targets = list(map(_target_of, self.axes))
+            self._sent = (self._sent[0], 0.0, self._no_velocities, targets, nothing, self.phase)
         else:
             demand.step()
-            for axis, target, torque in zip(axes, demand.targets, demand.torque_offsets, strict=True):
-                axis.target = target
-                axis.torque_offset = torque
             self.phase = demand.phase
             self._sent = (
                 demand.master_position,
                 demand.master_velocity,
-                demand.velocities.copy(),
-                demand.targets.copy(),
-                demand.torque_offsets.copy(),
-                int(demand.phase),
+                demand.velocities,
+                demand.targets,
+                demand.torque_offsets,
+                demand.phase,
             )
-        for axis in axes:
-            payload = RPDO_LAYOUT.pack(axis.controlword, axis.target, axis.torque_offset)
+        _, _, _, targets, torque_offsets, _ = self._sent
+        outbox = self.outbox
+        for number, axis in enumerate(self.axes):
+            axis.target = targets[number]
+            axis.torque_offset = torque_offsets[number]
+            payload = _pack_rpdo(axis.controlword, axis.target, axis.torque_offset)
             outbox.append(Frame(axis.rpdo_cob_id, payload))
 
     def _check(self, now_ns: int) -> None:
         guard = self.guard
         targets = self._in_force[3]
-        is_guarding = self.is_guarding_enabled
         for number, axis in enumerate(self.axes):
             if self._awaited >> number & 1:
                 guard.hold(Condition.MISSED_TPDO, number, self.cycle, 0, now_ns)
                 continue
-            guard.clear(Condition.MISSED_TPDO, number)
-            if not is_guarding:
+            if not guard.is_quiet:
+                guard.clear(Condition.MISSED_TPDO, number)
+            if not self.is_guarding_enabled:
                 continue
             if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
                 guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, STATUSWORD_OPERATION_ENABLED, now_ns)
-            else:
+            elif not guard.is_quiet:
                 guard.clear(Condition.DRIVE_FAULT, number)
             error = targets[number] - axis.actual
-            if -axis.following_error_limit <= error <= axis.following_error_limit:
+            limit = axis.following_error_limit
+            if not -limit <= error <= limit:
+                guard.hold(Condition.FOLLOWING_ERROR, number, error, limit, now_ns)
+            elif not guard.is_quiet:
                 guard.clear(Condition.FOLLOWING_ERROR, number)
-            else:
-                guard.hold(Condition.FOLLOWING_ERROR, number, error, axis.following_error_limit, now_ns)
         if guard.tripped:
             self.react()
 
@@ -294,8 +312,13 @@ class CyclicLoop:
         if lead_ns < 0:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
             self.guard.hold(Condition.MISSED_DEADLINE, 0, lead_ns, 0, self._sync_ns)
-        else:
+        elif not self.guard.is_quiet:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)
+        arrival_ns = self._arrival_ns - self._sync_ns
+        deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self._sync_period_ns, self._cpu_ns
+        spans_ns = (deviation_ns, period_ns, deviation_ns, arrival_ns, lead_ns, cpu_ns)
+        if max(spans_ns) > INT32_MAX or min(spans_ns) < -INT32_MAX:
+            spans_ns = map(saturate_int32, spans_ns)
         master_position, master_velocity, velocities, targets, torque_offsets, phase = self._in_force
         axes = self.axes
         self._sink.append(
@@ -304,18 +327,13 @@ class CyclicLoop:
             master_position,
             master_velocity,
             *velocities,
-            saturate_int32(self._sync_deviation_ns),
-            saturate_int32(self._sync_period_ns),
-            saturate_int32(self._sync_deviation_ns),
-            saturate_int32(self._arrival_ns - self._sync_ns),
-            saturate_int32(lead_ns),
-            saturate_int32(self._cpu_ns),
+            *spans_ns,
             phase,
             self._flags,
             *targets,
-            *[axis.actual for axis in axes],
-            *[axis.statusword for axis in axes],
-            *[axis.torque for axis in axes],
+            *map(_actual_of, axes),
+            *map(_statusword_of, axes),
+            *map(_torque_of, axes),
             *torque_offsets,
         )
 

@@ -19,7 +19,10 @@ PHASE_OF_PLAN: Final = {
 
 
 class Demand(Protocol):
-    """What the cycle asks for its targets; all attributes are those of the last step taken."""
+    """What the cycle asks for its targets; all attributes are those of the last step taken.
+
+    The lists are new ones after every step, so that whoever keeps one keeps that step's values.
+    """
 
     targets: list[int]
     """Counts, one an axis."""
@@ -96,12 +99,13 @@ class CamDemand:
         theta5, slope, _, _ = self._cam.at(position)
         self.master_position = position
         self.master_velocity = velocity
-        self.velocities[MASTER] = velocity
-        self.velocities[SLAVE] = slope * velocity
-        self.targets[MASTER] = self._units[MASTER].counts(position)
-        self.targets[SLAVE] = self._units[SLAVE].counts(theta5)
+        self.velocities = [velocity, slope * velocity]
+        self.targets = [self._units[MASTER].counts(position), self._units[SLAVE].counts(theta5)]
+        self.torque_offsets = [0, 0]
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
-        self.phase = Phase.CONTROLLED_STOP if self._is_stopping and phase is not Phase.STANDSTILL else phase
+        self.phase = phase
+        if self._is_stopping and phase is not Phase.STANDSTILL:
+            self.phase = Phase.CONTROLLED_STOP
 
     def controlled_stop(self) -> None:
         """Ramp the master down from where it is; see ``Demand``."""

@@ -64,6 +64,8 @@ class Guard:
         self._reaction = {condition: rule.reaction for condition, rule in rules.items()}
         self._axis_names = axis_names
         self._counts = {condition: [0] * len(axis_names) for condition in Condition}
+        self.is_quiet = True
+        """No counter stands above zero: ``clear`` would change nothing."""
         self.reaction: Reaction | None = None
         """The strongest reaction that has been called for so far, warnings apart."""
         self.stopped_by: StopReason | None = None
@@ -73,11 +75,15 @@ class Guard:
 
     def clear(self, condition: Condition, axis: int) -> None:
         """The condition does not hold in this cycle."""
-        self._counts[condition][axis] = 0
+        counts = self._counts[condition]
+        if counts[axis]:
+            counts[axis] = 0
+            self.is_quiet = not any(map(any, self._counts.values()))
 
     def hold(self, condition: Condition, axis: int, value: int, limit: int, now_ns: int) -> None:
         """The condition holds in this cycle; ``axis`` 0 is used where it is not one axis'."""
         counts = self._counts[condition]
+        self.is_quiet = False
         counts[axis] += 1
         if counts[axis] != self._persistence[condition]:
             return
