@@ -96,11 +96,13 @@ class Entry:
 class LiveDictionary:
     """Values over an ObjectDictionary, with access by SDO and by the drive itself."""
 
-    __slots__ = ("_entries", "description")
+    __slots__ = ("_entries", "description", "refusals")
 
     def __init__(self, description: ObjectDictionary) -> None:
         self.description: Final = description
         self._entries: Final = {(v.index, v.subindex): Entry(v) for v in description}
+        self.refusals: dict[tuple[int, int | None], AbortCode] = {}
+        """Objects to which an SDO client gets no access, and the code that tells him; sub-index None: all of them."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
@@ -121,6 +123,10 @@ class LiveDictionary:
 
         A sub-index that a VAR object does not have is its own error too. Dummy entries are there for PDO mapping alone.
         """
+        if self.refusals:
+            refusal = self.refusals.get((index, subindex), self.refusals.get((index, None)))
+            if refusal is not None:
+                return refusal
         entry = self._entries.get((index, subindex))
         if entry is not None and index >= DEVICE_TYPE:
             return entry
