@@ -129,6 +129,27 @@ class TickRecord(NamedTuple):
     torques_Nm: tuple[float, ...]
 
 
+class DriveTap(Protocol):
+    """What may stand between a drive and its surroundings, to make faults; see `EmulatedMachine.put_tap`."""
+
+    @property
+    def is_brake_broken(self) -> bool:
+        """Whether the holding brake does not hold."""
+        ...
+
+    def show(self, counts: int) -> int:
+        """What the drive is shown in place of the resolver's counts."""
+        ...
+
+    def hear(self, frame: Frame, now_ns: int) -> Sequence[Frame]:
+        """The frames that reach the drive at once in place of ``frame``."""
+        ...
+
+    def tell(self, frame: Frame, now_ns: int) -> Sequence[Frame]:
+        """The frames that reach the bus at once in place of ``frame``, which the drive has sent."""
+        ...
+
+
 class _Motor:
     """One axis of the machine: its drive, scaling and servo loop, and the resolver at the last servo tick."""
 
@@ -146,6 +167,7 @@ class _Motor:
         "permille_per_Nm",
         "receive",
         "servo",
+        "tap",
         "velocity",
     )
 
@@ -161,6 +183,7 @@ class _Motor:
         self.velocity = 0.0
         """Counts/s, over the last servo period."""
         self.is_powered = False
+        self.tap: DriveTap | None = None
         # Looked up once: they are asked for at every frame and tick.
         self.receive = drive.receive
         self.next_wake_ns = drive.next_wake_ns
@@ -169,7 +192,13 @@ class _Motor:
 
     def quantise(self, angle_rad: float) -> int:
         """What the resolver shows at this angle."""
-        return floor(angle_rad * self.counts_per_rad + self.noise + 0.5)
+        counts = floor(angle_rad * self.counts_per_rad + self.noise + 0.5)
+        return counts if self.tap is None else self.tap.show(counts)
+
+    def receive_through_tap(self, frame: Frame, now_ns: int) -> None:
+        if self.tap is not None:
+            for heard in self.tap.hear(frame, now_ns):
+                self.drive.receive(heard, now_ns)
 
 
 class EmulatedMachine:
@@ -263,6 +292,32 @@ class EmulatedMachine:
         """The servo loop of an axis, for diagnosis."""
         return self._motors[axis].servo
 
+    def put_tap(self, axis: int, tap: DriveTap) -> None:
+        """Put ``tap`` between the drive of an axis and all that it hears, sends and measures, for good."""
+        motor = self._motors[axis]
+        motor.tap = tap
+        motor.receive = motor.receive_through_tap
+
+    def deliver(self, axis: int, frame: Frame, now_ns: int) -> None:
+        """Let a drive hear a frame that its tap has held back."""
+        motor = self._motors[axis]
+        motor.drive.receive(frame, now_ns)
+        self._ask_wake(motor)
+        self._exchange(now_ns)
+
+    def transmit(self, axis: int, frame: Frame, now_ns: int) -> None:
+        """Put a frame of a drive on the bus that its tap has held back."""
+        self._frames.append(frame)
+        if frame.cob_id in self._routes:
+            self._tell_others(self._motors[axis], frame, now_ns)
+        self._exchange(now_ns)
+
+    def refresh(self, now_ns: int) -> None:
+        """Ask every drive for its frames, events and next wake, after something outside has changed one."""
+        for motor in self._motors:
+            self._ask_wake(motor)
+        self._exchange(now_ns)
+
     def receive(self, frame: Frame, now_ns: int) -> None:
         """Hand a frame of the bus to the drives that listen to it."""
         if self._due_ns < now_ns:
@@ -345,10 +400,13 @@ class EmulatedMachine:
             if axis.resolver_noise_counts > 0.0:
                 motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
             counts = floor(plant.angle(index) * motor.counts_per_rad + motor.noise + 0.5)
+            tap = motor.tap
+            if tap is not None:
+                counts = tap.show(counts)
             motor.velocity = velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
             motor.counts = counts
             drive.on_servo_tick(now_ns, counts, velocity)
-            brakes[index] = not drive.brake_released
+            brakes[index] = not drive.brake_released and (tap is None or not tap.is_brake_broken)
             if drive.is_powered:
                 demand = drive.position_demand_counts
                 if not motor.is_powered:
@@ -390,6 +448,8 @@ class EmulatedMachine:
                 if motor.outbox:
                     frames = motor.outbox.copy()
                     motor.outbox.clear()
+                    if motor.tap is not None:
+                        frames = [told for frame in frames for told in motor.tap.tell(frame, now_ns)]
                     self._frames += frames
                     for frame in frames:
                         if frame.cob_id in self._routes:
@@ -424,8 +484,9 @@ class EmulatedMachine:
                 offset_s = 0.0
             elif offset_s > SERVO_PERIOD_S:
                 offset_s = SERVO_PERIOD_S
+            counts = floor(angle(index, offset_s) * motor.counts_per_rad + motor.noise + 0.5)
             return (
-                floor(angle(index, offset_s) * motor.counts_per_rad + motor.noise + 0.5),
+                counts if motor.tap is None else motor.tap.show(counts),
                 motor.velocity,
                 floor(torque(index) * motor.permille_per_Nm + 0.5),
             )
