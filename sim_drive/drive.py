@@ -109,6 +109,8 @@ class Drive:
         self.nmt_state = NmtState.BOOT_UP
         self._boot_due_ns: int | None = 0
         self._is_powered_on = False
+        self.is_switched_off = False
+        """Without supply, by ``switch_off``."""
         self._next_wake_ns: int | None = 0
         self._is_wake_stale = False
 
@@ -134,6 +136,8 @@ class Drive:
     def wake(self, now_ns: int) -> None:
         """Do what is due."""
         self._is_wake_stale = True
+        if self.is_switched_off:
+            return
         if self._boot_due_ns is not None:
             if not self._is_powered_on:
                 self._is_powered_on = True
@@ -163,6 +167,8 @@ class Drive:
         return events
 
     def _find_next_wake(self) -> int | None:
+        if self.is_switched_off:
+            return None
         if self._boot_due_ns is not None:
             return self._boot_due_ns
         dues = [self._consumer.next_wake_ns(), self._sdo.next_wake_ns(), self._producer.next_wake_ns()]
@@ -183,6 +189,9 @@ class Drive:
 
     def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None:
         """One servo period, with the resolver's counts since power-on."""
+        if self.is_switched_off:
+            self.axis.shaft_counts = shaft_counts
+            return
         self.axis.on_tick(now_ns, shaft_counts)
         if self._event_tpdos and self.nmt_state is _OPERATIONAL:
             for tpdo in self._event_tpdos:
@@ -233,12 +242,44 @@ class Drive:
         return self.axis.shaft_counts, 0.0, 0
 
     def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
-        """Make the drive fault: EMCY, fault reaction, fault. ``persists`` until ``end_trip`` is called."""
-        self.axis.trip(error_code, error_register_bits, now_ns, persists=persists)
+        """Make the drive fault: EMCY, fault reaction, fault. ``persists`` until ``end_trip`` is called.
+
+        A drive that is switched off notices nothing but a cause that persists, once it is on again.
+        """
+        if not self.is_switched_off:
+            self.axis.trip(error_code, error_register_bits, now_ns, persists=persists)
+        elif persists:
+            self._emergency.raise_error(error_code, error_register_bits, now_ns, is_fault=True, persists=True)
 
     def end_trip(self, error_code: int, now_ns: int) -> None:
         """The cause of a persisting trip has gone, so that a fault reset is accepted again."""
         self._emergency.end_cause(error_code, now_ns)
+
+    def warn(self, error_code: int, error_register_bits: int, now_ns: int) -> None:
+        """Raise an error that does not lead to a fault; it lasts until ``end_trip`` is called."""
+        if not self.is_switched_off:
+            self._emergency.raise_error(error_code, error_register_bits, now_ns, is_fault=False, persists=True)
+
+    def lose_connection(self, now_ns: int) -> None:
+        """The drive has been cut off from the bus: an enabled axis faults (8100h)."""
+        if not self.is_switched_off:
+            self._lose_connection(now_ns)
+
+    def switch_off(self, now_ns: int) -> None:
+        """Take the supply away: no torque, brake engaged, deaf and mute, and all that is in RAM is lost."""
+        self.is_switched_off = True
+        self._enter(NmtState.BOOT_UP, now_ns)
+        self._reset(True, now_ns)
+        self.outbox.clear()
+        self._is_wake_stale = True
+
+    def switch_on(self, now_ns: int) -> None:
+        """Give the supply back: the drive boots."""
+        if self.is_switched_off:
+            self.is_switched_off = False
+            self._is_powered_on = False
+            self._boot_due_ns = now_ns
+            self._is_wake_stale = True
 
     # -- NMT -----------------------------------------------------------------------------------------------------
 
@@ -275,6 +316,9 @@ class Drive:
         self._emergency.restore()
         self._handlers = {}
         self.subscriptions_changed = True
+        if self.is_switched_off:
+            self._boot_due_ns = None
+            return
         self._boot_due_ns = now_ns + round(self.settings.boot_up_delay_s * _NS_PER_S)
         if now_ns >= self._boot_due_ns:
             self._boot_up(now_ns)
