@@ -11,11 +11,19 @@ ERROR_REGISTER: Final = 0x1001
 PREDEFINED_ERROR_FIELD: Final = 0x1003
 COB_ID_SYNC: Final = 0x1005
 COMMUNICATION_CYCLE_PERIOD: Final = 0x1006
+SYNCHRONOUS_WINDOW_LENGTH: Final = 0x1007
 MANUFACTURER_DEVICE_NAME: Final = 0x1008
+GUARD_TIME: Final = 0x100C
+LIFE_TIME_FACTOR: Final = 0x100D
+STORE_PARAMETERS: Final = 0x1010
+RESTORE_DEFAULT_PARAMETERS: Final = 0x1011
+COB_ID_TIME: Final = 0x1012
 COB_ID_EMCY: Final = 0x1014
+INHIBIT_TIME_EMCY: Final = 0x1015
 CONSUMER_HEARTBEAT_TIME: Final = 0x1016
 PRODUCER_HEARTBEAT_TIME: Final = 0x1017
 IDENTITY: Final = 0x1018
+SYNCHRONOUS_COUNTER_OVERFLOW: Final = 0x1019
 ERROR_BEHAVIOUR: Final = 0x1029
 RPDO_COMMUNICATION: Final = 0x1400
 RPDO_MAPPING: Final = 0x1600
@@ -77,3 +85,11 @@ CAM_MASTER_OFFSET: Final = 0x3012
 """INTEGER32: counts added to the master position before the table is read."""
 CONTROLLER_GAINS: Final = 0x3020
 """Record: K_P, K_I, K_D, K_V, K_F of the position controller as integers over 256 (INTEGER32 each)."""
+TIME_OF_DAY: Final = 0x3030
+"""Record, read only: what the TIME messages have told; UNSIGNED32 milliseconds after midnight, UNSIGNED16 days since
+1984-01-01."""
+
+# The areas of the object dictionary (CiA 301, table 40)
+COMMUNICATION_PROFILE_AREA: Final = range(0x1000, 0x2000)
+MANUFACTURER_PROFILE_AREA: Final = range(0x2000, 0x6000)
+STANDARDISED_PROFILE_AREA: Final = range(0x6000, 0xA000)

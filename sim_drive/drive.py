@@ -27,6 +27,8 @@ PDO_COUNT: Final = 4
 __all__ = ["PDO_COUNT", "Drive", "DriveIdentity", "DriveSettings", "NmtStateChanged"]
 
 _NS_PER_S: Final = 1_000_000_000
+_NS_PER_US: Final = 1_000
+_RESERVED_COUNTER_OVERFLOW: Final = 1
 _SYNC_GENERATE: Final = 1 << 30
 _EXTENDED_FRAME: Final = 1 << 29
 _COB_ID_MASK: Final = 0x7FF
@@ -38,6 +40,7 @@ _COMMUNICATION_ERRORS: Final = (
     EmergencyCode.PDO_TOO_SHORT,
     EmergencyCode.PDO_TOO_LONG,
     EmergencyCode.SYNC_LENGTH,
+    EmergencyCode.RPDO_TIMEOUT,
 )
 """Errors whose cause ends with a reset, because what noticed them starts anew."""
 
@@ -47,6 +50,7 @@ _SDO: Final = SetPointSource.SDO
 _SYNC: Final = SetPointSource.SYNC
 
 _Handler = Callable[[bytes, int], None]
+_RequestHandler = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +105,23 @@ class Drive:
         self._sync_rpdos: tuple[ReceivePdo, ...] = ()
         self._sync_tpdos: tuple[TransmitPdo, ...] = ()
         self._event_tpdos: tuple[TransmitPdo, ...] = ()
+        self._waiting_tpdos: tuple[TransmitPdo, ...] = ()
+        """Synchronous TPDOs whose SYNC start value has not come yet."""
+        self._monitored_rpdos: tuple[ReceivePdo, ...] = ()
         self._sync_cob_id = self.dictionary.entry(objects.COB_ID_SYNC)
         self._sync_cob_id.on_write = self._on_sync_cob_id
+        self._sync_period = self.dictionary.entry(objects.COMMUNICATION_CYCLE_PERIOD)
+        self._counter_overflow = self.dictionary.entry(objects.SYNCHRONOUS_COUNTER_OVERFLOW)
+        self._counter_overflow.on_write = self._on_counter_overflow
+        self._sync_window = self.dictionary.entry(objects.SYNCHRONOUS_WINDOW_LENGTH)
+        self._sync_window.on_write = self._on_sync_window
+        self._sync_at_ns: int | None = None
+        """The last SYNC, noted while there is a synchronous window; None before the first."""
         self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
 
         self._handlers: dict[int, _Handler] = {}
+        self._request_handlers: dict[int, _RequestHandler] = {}
+        """By the COB-ID of a remote frame."""
         self.nmt_state = NmtState.BOOT_UP
         self._boot_due_ns: int | None = 0
         self._is_powered_on = False
@@ -118,13 +134,21 @@ class Drive:
 
     def cob_ids(self) -> set[int]:
         """COB-IDs that the drive listens to."""
-        return set(self._handlers)
+        return {*self._handlers, *self._request_handlers}
 
     def receive(self, frame: Frame, now_ns: int) -> None:
         """Take a frame of another node; what is not for this drive passes by."""
         handler = self._handlers.get(frame.cob_id)
-        if handler is not None and not frame.is_remote:
+        if frame.is_remote:
+            self._take_request(frame.cob_id, now_ns)
+        elif handler is not None:
             handler(frame.data, now_ns)
+
+    def _take_request(self, cob_id: int, now_ns: int) -> None:
+        handler = self._request_handlers.get(cob_id)
+        if handler is not None:
+            self._is_wake_stale = True
+            handler(now_ns)
 
     def next_wake_ns(self) -> int | None:
         """When heartbeats, SDO or PDO timers, or the boot-up want ``wake``."""
@@ -150,6 +174,9 @@ class Drive:
         if self.nmt_state is NmtState.OPERATIONAL:
             for tpdo in self._event_tpdos:
                 tpdo.wake(now_ns)
+            for rpdo in self._monitored_rpdos:
+                if rpdo.deadline_ns is not None and now_ns >= rpdo.deadline_ns:
+                    self._miss(rpdo, now_ns)
         self._producer.wake(now_ns, self.nmt_state)
 
     def take_frames(self) -> list[Frame]:
@@ -174,6 +201,7 @@ class Drive:
         dues = [self._consumer.next_wake_ns(), self._sdo.next_wake_ns(), self._producer.next_wake_ns()]
         if self.nmt_state is NmtState.OPERATIONAL:
             dues += [tpdo.due_ns for tpdo in self._event_tpdos]
+            dues += [rpdo.deadline_ns for rpdo in self._monitored_rpdos]
         return min((due for due in dues if due is not None), default=None)
 
     # -- what the machine uses -----------------------------------------------------------------------------------
@@ -315,6 +343,7 @@ class Drive:
             self.axis.restore()
         self._emergency.restore()
         self._handlers = {}
+        self._request_handlers = {}
         self.subscriptions_changed = True
         if self.is_switched_off:
             self._boot_due_ns = None
@@ -338,43 +367,98 @@ class Drive:
         self.events.append(NmtStateChanged(now_ns, self.node_id, state))
         self._emergency.is_silent = state in {NmtState.STOPPED, NmtState.BOOT_UP}
         self._sdo.reset()
+        self._sync_at_ns = None
         for rpdo in self._rpdos:
-            rpdo.pending = None
+            rpdo.forget()
         if state is NmtState.OPERATIONAL:
             for tpdo in self._tpdos:
                 if tpdo.is_valid:
                     tpdo.begin(now_ns)
+            self._sort_synchronous_tpdos()
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
     def _on_pdo_change(self, now_ns: int) -> None:
-        tpdos = [tpdo for tpdo in self._tpdos if tpdo.is_valid and tpdo.length]
-        self._sync_tpdos = tuple(tpdo for tpdo in tpdos if not tpdo.is_event_driven)
-        self._event_tpdos = tuple(tpdo for tpdo in tpdos if tpdo.is_event_driven)
-        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if rpdo.is_valid and rpdo.length and rpdo.is_synchronous)
-        self._is_wake_stale = True
+        self._sort_synchronous_tpdos()
+        self._event_tpdos = tuple(tpdo for tpdo in self._tpdos if _is_used(tpdo) and tpdo.is_event_driven)
+        self._monitored_rpdos = tuple(rpdo for rpdo in self._rpdos if _is_used(rpdo) and rpdo.event_ns)
+        if not any(rpdo.is_late for rpdo in self._rpdos):
+            self._emergency.end_cause(EmergencyCode.RPDO_TIMEOUT, now_ns)
+        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if _is_used(rpdo) and rpdo.is_synchronous)
         self._subscribe()
+
+    def _sort_synchronous_tpdos(self) -> None:
+        """Part the synchronous TPDOs in those that a SYNC concerns, and those that wait for their first one."""
+        synchronous = [tpdo for tpdo in self._tpdos if _is_used(tpdo) and tpdo.is_synchronous]
+        has_counter = bool(self._counter_overflow.value)
+        waiting = [tpdo for tpdo in synchronous if has_counter and tpdo.sync_start_value and not tpdo.has_started]
+        self._waiting_tpdos = tuple(waiting)
+        self._sync_tpdos = tuple(tpdo for tpdo in synchronous if tpdo not in waiting)
 
     def _subscribe(self) -> None:
         handlers: dict[int, _Handler] = {}
         for rpdo in self._rpdos:
-            if rpdo.is_valid and rpdo.length:
+            if _is_used(rpdo):
                 _add(handlers, rpdo.cob_id, self._rpdo_handler(rpdo))
         for node_id in self._consumer.node_ids:
             _add(handlers, HEARTBEAT_BASE + node_id, self._heartbeat_handler(node_id))
-        _add(handlers, self._sync_cob_id.value & _COB_ID_MASK, self._on_sync)
+        is_plain = not self._counter_overflow.value and not self._sync_window.value
+        _add(handlers, self._sync_cob_id.value & _COB_ID_MASK, self._on_sync if is_plain else self._on_noted_sync)
         _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
         _add(handlers, NMT_COB_ID, self._on_nmt)
         self._handlers = handlers
+        self._request_handlers = {
+            tpdo.cob_id: self._request_handler(tpdo)
+            for tpdo in self._tpdos
+            if _is_used(tpdo) and tpdo.is_sent_on_request
+        }
         self._is_wake_stale = True
         self.subscriptions_changed = True
 
     def _rpdo_handler(self, rpdo: ReceivePdo) -> _Handler:
         receive = rpdo.receive
+        window_ns = self._sync_window.value * _NS_PER_US if rpdo.is_synchronous else 0
+        if window_ns or rpdo.event_ns:
+            return self._guarded_rpdo_handler(rpdo, window_ns)
 
         def handle(data: bytes, now_ns: int) -> None:
             if self.nmt_state is _OPERATIONAL:
                 receive(data, now_ns)
+
+        return handle
+
+    def _guarded_rpdo_handler(self, rpdo: ReceivePdo, window_ns: int) -> _Handler:
+        """With synchronous window (0: none) or event timer.
+
+        What comes later after a SYNC than the window is long is not used (CiA 301, 7.5.2.8). No EMCY tells of it: the
+        standard leaves that open, and has no code for it.
+        """
+
+        def handle(data: bytes, now_ns: int) -> None:
+            if self.nmt_state is not _OPERATIONAL:
+                return
+            if rpdo.event_ns:
+                rpdo.note_arrival(data, now_ns)
+                self._is_wake_stale = True
+                if not any(other.is_late for other in self._rpdos):
+                    self._emergency.end_cause(EmergencyCode.RPDO_TIMEOUT, now_ns)
+            if not window_ns or self._sync_at_ns is None or now_ns - self._sync_at_ns <= window_ns:
+                rpdo.receive(data, now_ns)
+
+        return handle
+
+    def _miss(self, rpdo: ReceivePdo, now_ns: int) -> None:
+        """An RPDO has not come within its event time."""
+        rpdo.deadline_ns = None
+        rpdo.is_late = True
+        self._emergency.raise_error(
+            EmergencyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
+        )
+
+    def _request_handler(self, tpdo: TransmitPdo) -> _RequestHandler:
+        def handle(now_ns: int) -> None:
+            if self.nmt_state is _OPERATIONAL:
+                tpdo.on_request(now_ns)
 
         return handle
 
@@ -397,9 +481,7 @@ class Drive:
         if self.nmt_state is not _OPERATIONAL:
             return
         if data:
-            self._emergency.raise_error(
-                EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
-            )
+            self._refuse_sync(now_ns)
             return
         if self._emergency.has_errors:
             self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
@@ -415,6 +497,40 @@ class Drive:
                 rpdo.apply(pending, now_ns)
         axis.on_sync(now_ns)
         axis.source = _SDO
+
+    def _on_noted_sync(self, data: bytes, now_ns: int) -> None:
+        """A SYNC with counter, or with a synchronous window after it."""
+        if self.nmt_state is not _OPERATIONAL:
+            return
+        if len(data) != (1 if self._counter_overflow.value else 0):
+            self._refuse_sync(now_ns)
+            return
+        self._sync_at_ns = now_ns
+        if data and self._waiting_tpdos:
+            for tpdo in self._waiting_tpdos:
+                tpdo.has_started = data[0] == tpdo.sync_start_value
+            self._sort_synchronous_tpdos()
+        self._on_sync(b"", now_ns)
+
+    def _refuse_sync(self, now_ns: int) -> None:
+        self._emergency.raise_error(
+            EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
+        )
+
+    def _on_counter_overflow(self, value: int, now_ns: int) -> AbortCode | None:
+        if value == _RESERVED_COUNTER_OVERFLOW:
+            return AbortCode.VALUE_RANGE_EXCEEDED
+        if self._sync_period.value:
+            return AbortCode.CANNOT_STORE_DEVICE_STATE
+        self._counter_overflow.value = value
+        self._on_pdo_change(now_ns)
+        return None
+
+    def _on_sync_window(self, value: int, now_ns: int) -> AbortCode | None:
+        self._sync_window.value = value
+        self._sync_at_ns = None
+        self._subscribe()
+        return None
 
     def _on_sync_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
         if value & (_SYNC_GENERATE | _EXTENDED_FRAME) or not value & _COB_ID_MASK:
@@ -440,6 +556,11 @@ class Drive:
             self._enter(NmtState.PRE_OPERATIONAL, now_ns)
         elif action == 2 and self.nmt_state is not NmtState.STOPPED:
             self._enter(NmtState.STOPPED, now_ns)
+
+
+def _is_used(pdo: ReceivePdo | TransmitPdo) -> bool:
+    """Whether a PDO is valid and carries something."""
+    return pdo.is_valid and bool(pdo.length)
 
 
 def _add(handlers: dict[int, _Handler], cob_id: int, handler: _Handler) -> None:

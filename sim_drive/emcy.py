@@ -31,6 +31,7 @@ class EmergencyCode(IntEnum):
     PDO_TOO_SHORT = 0x8210
     PDO_TOO_LONG = 0x8220
     SYNC_LENGTH = 0x8240
+    RPDO_TIMEOUT = 0x8250
     FOLLOWING_ERROR = 0x8611
     SYNC_CONTROLLER = 0x8700
     """Set-points have failed to come for too many SYNC periods."""

@@ -13,13 +13,17 @@ from typing import Any, Final, Protocol
 from drivers import objects
 from drivers.frame import Frame
 from drivers.object_dictionary import FORMAT
-from drivers.pdo import PDO_COB_ID_INVALID, PDO_MAX_ENTRIES, MappingEntry
+from drivers.pdo import PDO_COB_ID_INVALID, PDO_COB_ID_NO_RTR, PDO_MAX_ENTRIES, MappingEntry
 from drivers.sdo import AbortCode
 from sim_drive.axis import Axis, SetPointSource
 from sim_drive.dictionary import Entry, LiveDictionary, WriteHook
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 
 LAST_SYNCHRONOUS_TYPE: Final = 240
+SYNCHRONOUS_ON_REQUEST: Final = 252
+"""TPDO that is sampled at every SYNC and sent on a remote request."""
+EVENT_ON_REQUEST: Final = 253
+"""TPDO that is sampled and sent on a remote request."""
 EVENT_DRIVEN_TYPES: Final = frozenset({254, 255})
 PDO_MAX_BITS: Final = 64
 
@@ -51,6 +55,7 @@ class _Sub(IntEnum):
     TRANSMISSION_TYPE = 2
     INHIBIT_TIME = 3
     EVENT_TIMER = 5
+    SYNC_START_VALUE = 6
 
 
 class _Codec(Protocol):
@@ -217,12 +222,18 @@ class _Pdo:
             mapped = self._mapped(self._mapping[0].value)
             if isinstance(mapped, AbortCode):
                 return mapped
+        self.cob_id_entry.value = value
         self._compile(value, now_ns)
         self._on_change(now_ns)
         return None
 
+    def _is_type(self, value: int) -> bool:
+        if value in (SYNCHRONOUS_ON_REQUEST, EVENT_ON_REQUEST):
+            return not self._is_receive
+        return value <= LAST_SYNCHRONOUS_TYPE or value in EVENT_DRIVEN_TYPES
+
     def _on_type(self, value: int, now_ns: int) -> AbortCode | None:
-        if value > LAST_SYNCHRONOUS_TYPE and value not in EVENT_DRIVEN_TYPES:
+        if not self._is_type(value):
             return AbortCode.VALUE_RANGE_EXCEEDED
         self.type_entry.value = value
         self._restart(now_ns)
@@ -258,9 +269,20 @@ def is_restricted(cob_id: int) -> bool:
 
 
 class ReceivePdo(_Pdo):
-    """An RPDO: its data act at once, or wait for the SYNC."""
+    """An RPDO: its data act at once, or wait for the SYNC. With an event timer it is missed if it does not come."""
 
-    __slots__ = ("_axis", "_emergency", "_steps", "_unpack", "is_synchronous", "pending")
+    __slots__ = (
+        "_axis",
+        "_emergency",
+        "_event_entry",
+        "_steps",
+        "_unpack",
+        "deadline_ns",
+        "event_ns",
+        "is_late",
+        "is_synchronous",
+        "pending",
+    )
 
     def __init__(
         self,
@@ -271,11 +293,16 @@ class ReceivePdo(_Pdo):
         on_change: Callable[[int], None],
     ) -> None:
         """``number`` counts from 1."""
-        super().__init__(
-            dictionary, objects.RPDO_COMMUNICATION + number - 1, objects.RPDO_MAPPING + number - 1, on_change
-        )
+        communication = objects.RPDO_COMMUNICATION + number - 1
+        super().__init__(dictionary, communication, objects.RPDO_MAPPING + number - 1, on_change)
         self._axis = axis
         self._emergency = emergency
+        self._event_entry = dictionary.entry(communication, _Sub.EVENT_TIMER)
+        self._event_entry.on_write = self._on_event_timer
+        self.event_ns = 0
+        """How long it may fail to come, from the first time on that it has; 0: for ever."""
+        self.deadline_ns: int | None = None
+        self.is_late = False
         self._unpack: Callable[[bytes], tuple[Any, ...]] = _unpack_nothing
         self._steps: tuple[tuple[Entry, WriteHook | None, bool], ...] = ()
         self.is_synchronous = False
@@ -287,8 +314,28 @@ class ReceivePdo(_Pdo):
         self._steps = tuple((entry, entry.on_write, entry.is_unlimited) for entry in self.entries)
 
     def _start(self, now_ns: int) -> None:
-        self.pending = None
         self.is_synchronous = self.transmission_type <= LAST_SYNCHRONOUS_TYPE
+        self.event_ns = self._event_entry.value * _NS_PER_MS
+        self.is_late = False
+        self.forget()
+
+    def forget(self) -> None:
+        """The node has changed its state: nothing waits for a SYNC, and nothing is missed before it has come again."""
+        self.pending = None
+        self.deadline_ns = None
+
+    def note_arrival(self, data: bytes, now_ns: int) -> None:
+        """Start the event timer anew; what is too short to be used is no arrival."""
+        if len(data) >= self.length:
+            self.is_late = False
+            self.deadline_ns = now_ns + self.event_ns
+
+    def _on_event_timer(self, value: int, now_ns: int) -> AbortCode | None:
+        self.event_ns = value * _NS_PER_MS
+        self.deadline_ns = None
+        self.is_late = False
+        self._on_change(now_ns)
+        return None
 
     def receive(self, data: bytes, now_ns: int) -> None:
         """Take the PDO's data; too short is refused, too long is used as far as mapped (CiA 301, 7.2.2.5.1)."""
@@ -320,7 +367,7 @@ class ReceivePdo(_Pdo):
 
 
 class TransmitPdo(_Pdo):
-    """A TPDO: sent at SYNCs, or on events with inhibit and event time."""
+    """A TPDO: sent at SYNCs, on events with inhibit and event time, or on remote requests."""
 
     __slots__ = (
         "_axis",
@@ -332,9 +379,12 @@ class TransmitPdo(_Pdo):
         "_last_sources",
         "_outbox",
         "_pack",
+        "_sampled",
         "_sources",
+        "_start_entry",
         "_sync_count",
         "due_ns",
+        "has_started",
         "inhibited_until_ns",
         "is_event_driven",
     )
@@ -354,7 +404,9 @@ class TransmitPdo(_Pdo):
         self._outbox = outbox
         self._inhibit_entry = dictionary.entry(communication, _Sub.INHIBIT_TIME)
         self._event_entry = dictionary.entry(communication, _Sub.EVENT_TIMER)
+        self._start_entry = dictionary.entry(communication, _Sub.SYNC_START_VALUE)
         self._inhibit_entry.on_write = self._on_inhibit_time
+        self._start_entry.on_write = self._on_start_value
         self._event_entry.on_write = self._on_event_timer
         self._pack: Callable[..., bytes] = _pack_nothing
         self._sources: tuple[Entry, ...] = ()
@@ -363,6 +415,9 @@ class TransmitPdo(_Pdo):
         self._event_ns = 0
         self._sync_count = 0
         self._is_pending = False
+        self._sampled: bytes | None = None
+        self.has_started = False
+        """The SYNC whose counter is the start value has come, since the node became operational."""
         self.is_event_driven = False
         self.due_ns: int | None = None
         """When the event timer sends it, or the inhibit time lets it be sent."""
@@ -378,8 +433,25 @@ class TransmitPdo(_Pdo):
         self._event_ns = self._event_entry.value * _NS_PER_MS
         self._sync_count = 0
         self._is_pending = False
+        self._sampled = None
+        self.has_started = False
         self.inhibited_until_ns = 0
         self._schedule(now_ns)
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether a SYNC has it sent or sampled."""
+        return self.transmission_type <= SYNCHRONOUS_ON_REQUEST
+
+    @property
+    def sync_start_value(self) -> int:
+        """Counter of the SYNC that is the first one for this PDO; 0: any."""
+        return self._start_entry.value
+
+    @property
+    def is_sent_on_request(self) -> bool:
+        """Whether a remote frame has it sent: bit 30 of its COB-ID allows it, and it is not bound to SYNCs."""
+        return not self.cob_id_entry.value & PDO_COB_ID_NO_RTR and self.transmission_type >= SYNCHRONOUS_ON_REQUEST
 
     def begin(self, now_ns: int) -> None:
         """The node has become operational: an event-driven PDO is sent once, the counting of SYNCs begins."""
@@ -398,11 +470,21 @@ class TransmitPdo(_Pdo):
         elif transmission_type == 0:
             if self._has_changed():
                 self.send(now_ns)
+        elif transmission_type == SYNCHRONOUS_ON_REQUEST:
+            self._sampled = self._pack(*map(_value_of, self.entries))
         else:
             self._sync_count += 1
             if self._sync_count >= transmission_type:
                 self._sync_count = 0
                 self.send(now_ns)
+
+    def on_request(self, now_ns: int) -> None:
+        """Answer a remote frame: type 252 with the sample of the last SYNC (there may be none yet), others afresh."""
+        if self.transmission_type != SYNCHRONOUS_ON_REQUEST:
+            self._axis.sample(now_ns)
+            self.send(now_ns)
+        elif self._sampled is not None:
+            self._outbox.append(Frame(self.cob_id, self._sampled))
 
     def poll(self, now_ns: int) -> bool:
         """Event-driven: send if something has changed; gives whether ``due_ns`` may have changed."""
@@ -437,6 +519,9 @@ class TransmitPdo(_Pdo):
             return False
         self._last_sources = sources
         return True
+
+    def _on_start_value(self, value: int, now_ns: int) -> AbortCode | None:
+        return AbortCode.VALUE_RANGE_EXCEEDED if self.is_valid else None
 
     def _on_inhibit_time(self, value: int, now_ns: int) -> AbortCode | None:
         if self.is_valid:

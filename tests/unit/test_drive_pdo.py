@@ -98,12 +98,19 @@ def test_rtr_bit_is_kept(bench: Bench):
     assert bench.read(0x1800, 1) == 0x80000185
 
 
-@pytest.mark.parametrize("kind", [241, 251, 252, 253])
-def test_reserved_and_remote_transmission_types_are_refused(bench: Bench, kind: int):
+@pytest.mark.parametrize("kind", [241, 251])
+def test_reserved_transmission_types_are_refused(bench: Bench, kind: int):
     assert bench.write(0x1400, 2, kind, 1) == RANGE
     assert bench.write(0x1800, 2, kind, 1) == RANGE
-    for good in (0, 1, 240, 254, 255):
-        assert bench.write(0x1800, 2, good, 1) == 0
+
+
+def test_types_on_remote_request_are_for_tpdos_alone(bench: Bench):
+    for kind in (0, 1, 240, 254, 255):
+        assert bench.write(0x1400, 2, kind, 1) == 0
+        assert bench.write(0x1800, 2, kind, 1) == 0
+    for kind in (252, 253):
+        assert bench.write(0x1400, 2, kind, 1) == RANGE
+        assert bench.write(0x1800, 2, kind, 1) == 0
 
 
 def test_subscriptions_follow_the_configuration(bench: Bench):
