@@ -198,6 +198,11 @@ def set_up_heartbeats(master: Master, node: NodeSettings, network: NetworkSettin
     master.watch_heartbeat(node_id, network.heartbeat_timeout_ms / 1000.0)
 
 
+def release_heartbeat(master: Master, node: NodeSettings) -> Procedure[None]:
+    """Let the drive watch over the gateway no more."""
+    yield from master.write(node.node_id, objects.CONSUMER_HEARTBEAT_TIME, 1, U32, 0)
+
+
 def start_nodes(master: Master, nodes: Sequence[NodeSettings]) -> None:
     """NMT start, node by node: nodes that are not ours stay as they are."""
     for node in nodes:

@@ -3,18 +3,26 @@
 It implements ``drivers.node.Node``; the virtual-time and the real-time host drive the same object.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 from drivers import cia402, objects
 from drivers.cia402 import ModeOfOperation, State, Statusword, state_of
-from drivers.errors import DriveError, NoAnswerError
+from drivers.errors import DriveError, NoAnswerError, NodeError
 from drivers.frame import Frame
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, Master, NodeStateChanged, Procedure
 from drivers.nmt import NmtCommand, NmtState
 from drivers.node import Event
 from drivers.object_dictionary import DataType
-from gateway.commissioning import NetworkSettings, NodeSettings, commission, for_all, start_nodes
+from gateway.commissioning import (
+    NetworkSettings,
+    NodeSettings,
+    commission,
+    for_all,
+    release_heartbeat,
+    start_nodes,
+)
 from gateway.cycle import AxisChannel, CyclicLoop
 from gateway.demand import CamDemand
 from gateway.errors import CommissioningError, GatewayError
@@ -73,7 +81,9 @@ class GatewayCore:
         demand: CamDemand,
         plan: MasterPlan,
         guard: Guard,
+        is_homing_again: bool = False,
     ) -> None:
+        """``is_homing_again``: home the axes where they stand even if their drives are homed already."""
         self.loop = loop
         self.master = master
         self.is_done = False
@@ -86,6 +96,7 @@ class GatewayCore:
         self._demand = demand
         self._plan = plan
         self._guard = guard
+        self._is_homing_again = is_homing_again
         self._is_stop_requested = False
         self._is_interruptible = True
         """Before anything is in motion a stop request ends the session where it is."""
@@ -254,10 +265,15 @@ class GatewayCore:
         node_id, channel = axis.node.node_id, axis.channel
         yield from self.master.write(node_id, objects.HOMING_METHOD, 0, DataType.INTEGER8, axis.homing_method or 0)
         yield from self._set_mode(axis, ModeOfOperation.HOMING)
+        yield from self._cycles(START_CYCLES)
+        if channel.statusword & Statusword.MODE_SPECIFIC_12 and not self._is_homing_again:
+            # To home it anew, wherever it stands, would give the linkage a wrong phase between its axes.
+            self._step(f"axis {axis.node.name} is homed already")
+            return
         yield from self._enable(axis)
         channel.controlword = cia402.COMMAND_ENABLE_OPERATION | int(cia402.Controlword.MODE_SPECIFIC_4)
         # An earlier homing may still be shown as attained until the drive has seen the new start.
-        yield from self.master.pause(START_CYCLES * self.loop.period_ns / NS_PER_S)
+        yield from self._cycles(START_CYCLES)
         done = Statusword.TARGET_REACHED | Statusword.MODE_SPECIFIC_12
         attained = yield from self.master.wait_for(
             lambda: channel.statusword & done == done or bool(channel.statusword & Statusword.MODE_SPECIFIC_13),
@@ -269,6 +285,9 @@ class GatewayCore:
             )
         channel.controlword = cia402.COMMAND_ENABLE_OPERATION
         yield from self._disable(axis)
+
+    def _cycles(self, count: int) -> Procedure[None]:
+        yield from self.master.pause(count * self.loop.period_ns / NS_PER_S)
 
     def _set_mode(self, axis: AxisSetup, mode: ModeOfOperation) -> Procedure[None]:
         node_id = axis.node.node_id
@@ -287,7 +306,7 @@ class GatewayCore:
         channel = axis.channel
         if state_of(channel.statusword) in {State.FAULT, State.FAULT_REACTION_ACTIVE}:
             channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
-            yield from self.master.pause(START_CYCLES * self.loop.period_ns / NS_PER_S)
+            yield from self._cycles(START_CYCLES)
             channel.controlword = cia402.COMMAND_FAULT_RESET
             yield from self.master.wait_for(lambda: state_of(channel.statusword) is not State.FAULT, DISABLE_TIMEOUT_S)
             channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
@@ -321,10 +340,11 @@ class GatewayCore:
         self._step("enabling the axes")
         mode = ModeOfOperation.CYCLIC_SYNCHRONOUS_POSITION
         yield from for_all(self._nodes, lambda node: self._set_mode(self._axes[self._axis_of_node[node.node_id]], mode))
-        targets = self._demand.start_targets(self._plan.at(0.0)[0])
+        master, slave = (axis.channel.actual for axis in self._axes)
+        targets = self._demand.align(self._plan.at(0.0)[0], (master, slave))
         problems = [
             f"axis {axis.node.name}: stands at {axis.channel.actual} counts, the cam starts at {target}, "
-            f"which is more than {START_WINDOW_COUNTS} counts away"
+            f"which is more than {START_WINDOW_COUNTS} counts away; bring the linkage to its home position"
             for axis, target in zip(self._axes, targets, strict=True)
             if abs(axis.channel.actual - target) > START_WINDOW_COUNTS
         ]
@@ -386,4 +406,8 @@ class GatewayCore:
         for node in self._nodes:
             self.master.watch_heartbeat(node.node_id, 0.0)
             self.master.command(NmtCommand.ENTER_PRE_OPERATIONAL, node.node_id)
+        for node in self._nodes:
+            # Else every drive would miss our heartbeat, and say so on the bus, as soon as we are gone.
+            with suppress(NodeError):
+                yield from release_heartbeat(self.master, node)
         self._step("done")

@@ -21,7 +21,7 @@ from drivers.pdo import RPDO_BASE, TPDO_BASE, PdoLayout
 from gateway.demand import Demand
 from gateway.guard import Condition, Guard, StopReason
 from gateway.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
-from gateway.units import AxisUnits
+from gateway.units import HALF_RANGE, RANGE_MASK, AxisUnits
 
 RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
 """Controlword, target position, torque offset."""
@@ -275,17 +275,17 @@ class CyclicLoop:
         targets = self._in_force[3]
         for number, axis in enumerate(self.axes):
             if self._awaited >> number & 1:
-                guard.hold(Condition.MISSED_TPDO, number, self.cycle, 0, now_ns)
+                self._hold_cycles(Condition.MISSED_TPDO, number, now_ns)
                 continue
             if not guard.is_quiet:
                 guard.clear(Condition.MISSED_TPDO, number)
             if not self.is_guarding_enabled:
                 continue
             if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
-                guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, STATUSWORD_OPERATION_ENABLED, now_ns)
+                guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, 0, now_ns)
             elif not guard.is_quiet:
                 guard.clear(Condition.DRIVE_FAULT, number)
-            error = targets[number] - axis.actual
+            error = (targets[number] - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
             limit = axis.following_error_limit
             if not -limit <= error <= limit:
                 guard.hold(Condition.FOLLOWING_ERROR, number, error, limit, now_ns)
@@ -293,6 +293,10 @@ class CyclicLoop:
                 guard.clear(Condition.FOLLOWING_ERROR, number)
         if guard.tripped:
             self.react()
+
+    def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:
+        cycles = self.guard.persistence(condition)
+        self.guard.hold(condition, number, cycles, cycles, now_ns)
 
     def react(self) -> None:
         """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
@@ -311,7 +315,7 @@ class CyclicLoop:
         lead_ns = self._sync_due_ns - self._sent_ns
         if lead_ns < 0:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
-            self.guard.hold(Condition.MISSED_DEADLINE, 0, lead_ns, 0, self._sync_ns)
+            self._hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
         elif not self.guard.is_quiet:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)
         arrival_ns = self._arrival_ns - self._sync_ns

@@ -47,6 +47,7 @@ class CyclicJob:
     host: str
     port: int
     parent_pid: int
+    is_homing_again: bool = False
 
     def to_json(self) -> str:
         """The job as it is sent to the process."""
@@ -103,7 +104,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
     config = parse_config(job.config_text, Path(job.config_path))
     profile = parse_cam_file(job.cam_text, "cam of the job").cam.profile
-    core = build_core(config, profile, plan(config, job.machine_cycles), ring, time.thread_time_ns)
+    core = build_core(config, profile, plan(config, job.machine_cycles), ring, time.thread_time_ns, job.is_homing_again)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def on_terminate(_number: int, _frame: FrameType | None) -> None:

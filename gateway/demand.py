@@ -3,7 +3,7 @@
 from typing import Final, Protocol
 
 from gateway.sample import Phase
-from gateway.units import AxisUnits
+from gateway.units import AxisUnits, wrap_counts
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import MasterPhase, MasterPlan, plan_stop
 
@@ -65,6 +65,8 @@ class CamDemand:
         self._step = 0
         self._acceleration = 0.0
         self._is_stopping = False
+        self._turns = (0, 0)
+        """Whole revolutions, in counts, that each axis stands away from the plan's: see ``align``."""
         self.targets = [0, 0]
         self.torque_offsets = [0, 0]
         self.velocities = [0.0, 0.0]
@@ -77,16 +79,27 @@ class CamDemand:
         self._plan = plan
         self._step = 0
         self._is_stopping = False
+        self.master_position, self.master_velocity, self._acceleration = plan.at(0.0)
 
     @property
     def is_finished(self) -> bool:
         """Whether the plan has been followed to its end."""
         return self._plan is not None and self._step * self._period_s >= self._plan.duration_s
 
-    def start_targets(self, master_position: float) -> tuple[int, int]:
-        """Counts of both axes with the master at this theta2: where they must stand before a plan begins there."""
+    def align(self, master_position: float, actuals: tuple[int, int]) -> tuple[int, int]:
+        """Counts of both axes with the master at this theta2: where they must stand before a plan begins there.
+
+        An axis that turns without end is asked for the revolution in which it stands (``actuals``), so that an earlier
+        run, which left it some revolutions on, needs no new homing.
+        """
         theta5 = self._cam.at(master_position)[0]
-        return self._units[MASTER].counts(master_position), self._units[SLAVE].counts(theta5)
+        targets = self._units[MASTER].counts(master_position), self._units[SLAVE].counts(theta5)
+        turns = [0, 0]
+        for number in (MASTER, SLAVE) if self._cam.net_turns else (MASTER,):
+            revolution = self._units[number].counts_per_revolution
+            turns[number] = round((actuals[number] - targets[number]) / revolution) * revolution
+        self._turns = (turns[MASTER], turns[SLAVE])
+        return targets[MASTER] + turns[MASTER], targets[SLAVE] + turns[SLAVE]
 
     def step(self) -> None:
         """Take the next step; see ``Demand``."""
@@ -100,7 +113,11 @@ class CamDemand:
         self.master_position = position
         self.master_velocity = velocity
         self.velocities = [velocity, slope * velocity]
-        self.targets = [self._units[MASTER].counts(position), self._units[SLAVE].counts(theta5)]
+        master_turns, slave_turns = self._turns
+        self.targets = [
+            wrap_counts(self._units[MASTER].counts(position) + master_turns),
+            wrap_counts(self._units[SLAVE].counts(theta5) + slave_turns),
+        ]
         self.torque_offsets = [0, 0]
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         self.phase = phase

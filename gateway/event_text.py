@@ -7,7 +7,7 @@ from enum import Enum
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
 from drivers.node import Event
 from gateway.core import StepReached
-from gateway.guard import GuardTripped
+from gateway.guard import Condition, GuardTripped
 
 EventData = dict[str, str | int | float | bool | None]
 
@@ -20,7 +20,7 @@ def describe(event: Event) -> tuple[str, str, EventData]:
         case GuardTripped(_, condition, axis, value, limit, reaction):
             where = f" on axis {axis}" if axis else ""
             name, answer = condition.value.replace("_", " "), reaction.value.replace("_", " ")
-            text = f"{name}{where}: {value} (limit {limit}), {answer}"
+            text = f"{name}{where}: {_guarded_value(condition, value, limit)}, {answer}"
             return "guard", text, {"condition": condition.value, "axis": axis, "value": value, "limit": limit}
         case EmergencyReceived(_, node_id, code, register, vendor):
             text = f"node {node_id} EMCY {code:04X}h, error register {register:02X}h"
@@ -34,6 +34,20 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return "nmt_state", text, {"node_id": node_id, "state": state.name.lower()}
         case _:
             return _describe_other(event)
+
+
+def _guarded_value(condition: Condition, value: int, limit: int) -> str:
+    match condition:
+        case Condition.FOLLOWING_ERROR:
+            return f"{value} counts (limit {limit})"
+        case Condition.MISSED_TPDO | Condition.MISSED_DEADLINE:
+            return f"{value} cycles in a row"
+        case Condition.EMERGENCY:
+            return f"{value:04X}h"
+        case Condition.DRIVE_FAULT:
+            return f"statusword {value:04X}h"
+        case Condition.HEARTBEAT_LOST:
+            return f"silent for {limit} ms, or restarted"
 
 
 def _describe_other(event: Event) -> tuple[str, str, EventData]:

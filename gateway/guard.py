@@ -42,8 +42,9 @@ STRENGTH = {Reaction.WARN: 0, Reaction.CONTROLLED_STOP: 1, Reaction.QUICK_STOP: 
 class GuardTripped(Event):
     """A guarded condition has held for its persistence.
 
-    ``axis`` is the axis' name, empty where the condition is not one axis'; ``value`` and ``limit`` are in the
-    condition's own unit (counts, cycles, an error code).
+    ``axis`` is the axis' name, empty where the condition is not one axis'. ``value`` and ``limit`` are in the
+    condition's own unit: counts for the following error, cycles in a row for missed TPDOs and deadlines, ms for the
+    heartbeat; the emergency error code or the statusword, with limit 0, for what has none.
     """
 
     condition: Condition
@@ -71,7 +72,12 @@ class Guard:
         self.stopped_by: StopReason | None = None
         """The first condition that called for more than a warning."""
         self.tripped: list[GuardTripped] = []
-        """Every trip, once each; the caller takes them away."""
+        """Every trip, the first of each condition and axis; the caller takes them away."""
+        self._told: set[tuple[Condition, int]] = set()
+
+    def persistence(self, condition: Condition) -> int:
+        """Cycles in a row that a condition must hold."""
+        return self._persistence[condition]
 
     def clear(self, condition: Condition, axis: int) -> None:
         """The condition does not hold in this cycle."""
@@ -88,9 +94,10 @@ class Guard:
         if counts[axis] != self._persistence[condition]:
             return
         reaction = self._reaction[condition]
-        is_of_one_axis = condition is not Condition.MISSED_DEADLINE
-        name = self._axis_names[axis] if is_of_one_axis else ""
-        self.tripped.append(GuardTripped(now_ns, condition, name, value, limit, reaction))
+        if (condition, axis) not in self._told:
+            self._told.add((condition, axis))
+            name = "" if condition is Condition.MISSED_DEADLINE else self._axis_names[axis]
+            self.tripped.append(GuardTripped(now_ns, condition, name, value, limit, reaction))
         if reaction is Reaction.WARN:
             return
         if self.stopped_by is None:

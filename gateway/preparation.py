@@ -158,6 +158,7 @@ def build_core(
     run_plan: MasterPlan,
     sink: SampleSink,
     cpu_clock: Callable[[], int] | None = None,
+    is_homing_again: bool = False,
 ) -> GatewayCore:
     """Put the gateway's parts together; see ``gateway.core``."""
     channels = [
@@ -177,4 +178,6 @@ def build_core(
         config.motion.ramp_acceleration_rad_per_s2,
         config.motion.ramp_jerk_rad_per_s3,
     )
-    return GatewayCore(setups, network_settings(config), build_master(config), loop, demand, run_plan, guard)
+    return GatewayCore(
+        setups, network_settings(config), build_master(config), loop, demand, run_plan, guard, is_homing_again
+    )

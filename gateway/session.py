@@ -79,6 +79,7 @@ def run_realtime(
     machine_cycles: int,
     is_overwriting: bool = False,
     with_frames: bool = False,
+    is_homing_again: bool = False,
     on_progress: Callable[[Progress], None] | None = None,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> None:
@@ -123,6 +124,7 @@ def run_realtime(
             host=address.host,
             port=address.port,
             parent_pid=os.getpid(),
+            is_homing_again=is_homing_again,
         )
         loop = subprocess.Popen(
             [sys.executable, "-m", "gateway.cyclic_process"],

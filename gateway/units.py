@@ -2,10 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
-COUNT_MIN = -(1 << 31)
-COUNT_MAX = (1 << 31) - 1
-TORQUE_MAX_PERMILLE = 32767
+HALF_RANGE: Final = 1 << 31
+RANGE_MASK: Final = (1 << 32) - 1
+TORQUE_MAX_PERMILLE: Final = 32767
+
+
+def wrap_counts(counts: int) -> int:
+    """Counts as INTEGER32, modulo 2^32: an axis that turns for ever passes the range of its position objects."""
+    return (counts + HALF_RANGE & RANGE_MASK) - HALF_RANGE
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,6 +92,7 @@ def _run_on_bus(
     cycles: int,
     is_overwriting: bool,
     frames: bool | None,
+    is_homing_again: bool = False,
 ) -> None:
     from gateway.session import Progress as RunProgress
     from gateway.session import StopSwitch, run_realtime
@@ -124,6 +125,7 @@ def _run_on_bus(
             machine_cycles=cycles,
             is_overwriting=is_overwriting,
             with_frames=address.interface == "socketcan" if frames is None else frames,
+            is_homing_again=is_homing_again,
             on_progress=on_progress,
             on_event=on_event,
         )
@@ -207,6 +209,10 @@ def run(
         bool | None,
         typer.Option("--frames/--no-frames", help="Record every CAN frame  [default: on socketcan, in virtual time]"),
     ] = None,
+    home_here: Annotated[
+        bool,
+        typer.Option("--home-here", help="Home the axes where they stand, even if their drives are homed already."),
+    ] = False,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     port: PortOption = None,
@@ -226,7 +232,7 @@ def run(
     else:
         count = settings.motion.machine_cycles if cycles is None else cycles
         address = resolve_bus(settings.bus, interface, channel, port)
-        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames)
+        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here)
     _show(recording, as_json, None)
 
 

@@ -350,6 +350,54 @@ def test_a_gateway_that_falls_silent_stops_the_machine():
     assert machine.plant.torn_at_s is None
 
 
+def next_session(session, **options):
+    """Another gateway on the machine that a session has left behind, on a bus of its own at the same time."""
+    following = Session(cycles=1, **options)
+    following.machine = session.machine
+    following.bus = VirtualBus(
+        [following.core, session.machine],
+        session.config.bus.bit_rate,
+        start_ns=session.bus.now_ns,
+        trace=lambda at_ns, frame: following.frames.append((at_ns, frame)),
+        on_event=lambda node, event: following.events.append(event) if node == 0 else None,
+    )
+    return following
+
+
+def test_a_second_run_goes_on_from_where_the_first_ended_without_homing_anew():
+    first = Session().to_end()
+    second = next_session(first)
+    second.bus.run_while(lambda: not second.core.is_done, second.bus.now_ns + 30 * SECOND)
+    assert second.core.failure is None
+    assert second.core.stopped_by is StopReason.COMPLETED
+    turned = round(first.prepared.plan.end_position / math.tau)
+    start = second.sink.samples["position_demand"][second.sink.samples["phase"] == Phase.RAMP_UP][0]
+    assert start[0] == pytest.approx(turned * 4096, abs=2)
+    assert "axis cv is homed already" in [event.step for event in second.events if hasattr(event, "step")]
+    assert second.cam_distance_counts() < 60
+    second.assert_safe()
+
+
+def test_a_machine_left_away_from_home_is_not_homed_where_it_happens_to_stand():
+    first = Session(cycles=5).until(3.0)
+    machine = first.machine
+    VirtualBus([machine], first.config.bus.bit_rate, start_ns=first.bus.now_ns).run_until(4 * SECOND)
+    second = next_session(first)
+    second.bus = VirtualBus([second.core, machine], 1_000_000, start_ns=4 * SECOND)
+    second.bus.run_while(lambda: not second.core.is_done, 10 * SECOND)
+    assert "bring the linkage to its home position" in str(second.core.failure)
+    assert second.core.stopped_by is StopReason.COMMISSIONING
+    assert not any(drive.is_powered for drive in machine.drives)
+    assert Phase.RAMP_UP not in second.sink.samples["phase"]
+
+
+def test_after_a_run_the_drives_do_not_miss_the_gateway():
+    session = Session().to_end()
+    session.bus.run_until(session.bus.now_ns + SECOND)
+    emergencies = [frame for _, frame in session.frames if frame.cob_id in {0x081, 0x082}]
+    assert emergencies == []
+
+
 def test_the_recording_of_a_run_holds_everything_a_report_needs(tmp_path):
     path = Path(tmp_path, "run.mcap")
     prepared = prepare(PAPER, 1)
