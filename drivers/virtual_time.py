@@ -163,55 +163,56 @@ class VirtualBus:
         self.refresh()
         late = self._late
         queues = self._numbered_queues
-        wire_ns = self._wire_ns
-        is_arbitration_due = self._on_wire is None and any(self._queues)
-        while condition is None or condition():
-            if is_arbitration_due:
-                is_arbitration_due = False
-                now_ns = self._now_ns
-            else:
-                now_ns = self._earliest_wake_ns
-                if self._frame_end_ns < now_ns:
-                    now_ns = self._frame_end_ns
-                if late and late[0][0] < now_ns:
-                    now_ns = late[0][0]
-                if now_ns < self._now_ns:
-                    now_ns = self._now_ns
-            if now_ns > limit_ns:
-                self._now_ns = limit_ns
-                return False
-            self._now_ns = now_ns
-            if self._frame_end_ns <= now_ns:
-                self._end_frame(now_ns)
-            while late and late[0][0] <= now_ns:
-                _, _, sender, frame = heapq.heappop(late)
-                self._deliver(sender, frame, now_ns)
-            if self._earliest_wake_ns <= now_ns:
-                self._wake_due(now_ns)
-            if self._on_wire is None:
-                # Arbitration: the lowest COB-ID among the oldest waiting frames wins, a data frame before a remote one.
-                best = _NEVER
-                for sender, queue in queues:
-                    if queue:
-                        cob_id, _, is_remote = queue[0]
-                        if cob_id * 2 + is_remote < best:
-                            best = cob_id * 2 + is_remote
-                            self._sender = sender
-                if best != _NEVER:
-                    self._on_wire = frame = self._queues[self._sender].popleft()
-                    self._frame_end_ns = now_ns + wire_ns[len(frame.data)]
+        now_ns = self._now_ns
+        sender = self._sender
+        frame = self._on_wire
+        frame_end_ns = self._frame_end_ns
+        if frame is None and any(self._queues):
+            # The wire is free and frames wait: as if a frame ended now, so that the first instant arbitrates.
+            frame_end_ns = now_ns
+        try:
+            while condition is None or condition():
+                next_ns = self._earliest_wake_ns
+                if frame_end_ns < next_ns:
+                    next_ns = frame_end_ns
+                if late and late[0][0] < next_ns:
+                    next_ns = late[0][0]
+                if next_ns > limit_ns:
+                    self._now_ns = limit_ns
+                    return False
+                if next_ns > now_ns:
+                    self._now_ns = now_ns = next_ns
+                if frame_end_ns <= now_ns:
+                    ended, frame, frame_end_ns = frame, None, _NEVER
+                    if ended is not None:
+                        self._end_frame(sender, ended, now_ns)
+                if late:
+                    self._deliver_late(now_ns)
+                if self._earliest_wake_ns <= now_ns:
+                    self._wake_due(now_ns)
+                if frame is None:
+                    # Arbitration: the lowest COB-ID among the oldest waiting frames wins, data before remote frames.
+                    best = _NEVER
+                    for index, queue in queues:
+                        if queue:
+                            cob_id, _, is_remote = queue[0]
+                            priority = cob_id * 2 + is_remote
+                            if priority < best:
+                                best = priority
+                                sender = index
+                    if best != _NEVER:
+                        frame = self._queues[sender].popleft()
+                        frame_end_ns = now_ns + self._wire_ns[len(frame.data)]
+        finally:
+            self._sender = sender
+            self._on_wire = frame
+            self._frame_end_ns = frame_end_ns
         return True
 
-    def _end_frame(self, now_ns: int) -> None:
-        """Take the frame off the wire and deliver it, or do with it what the faults say."""
-        frame = self._on_wire
-        if frame is None:
-            return
-        self._on_wire = None
-        self._frame_end_ns = _NEVER
+    def _end_frame(self, sender: int, frame: Frame, now_ns: int) -> None:
+        """A frame has left the wire: deliver it, or do with it what the faults say."""
         self._busy_ns += self._wire_ns[len(frame.data)]
         self._frame_count += 1
-        sender = self._sender
         if self._faults is None:
             self._deliver(sender, frame, now_ns)
             return
@@ -221,22 +222,30 @@ class VirtualBus:
             else:
                 heapq.heappush(self._late, (now_ns + delay_ns, next(self._late_count), sender, frame))
 
+    def _deliver_late(self, now_ns: int) -> None:
+        late = self._late
+        while late and late[0][0] <= now_ns:
+            _, _, sender, frame = heapq.heappop(late)
+            self._deliver(sender, frame, now_ns)
+
     def _deliver(self, sender: int, frame: Frame, now_ns: int) -> None:
         if self._trace is not None:
             self._trace(now_ns, frame)
         wakes = self._wakes
-        on_event = self._on_event
         for index, receive, take_frames, next_wake_ns, take_events, queue in self._listeners[sender]:
             receive(frame, now_ns)
             frames = take_frames()
             if frames:
                 queue.extend(frames)
             wake_ns = next_wake_ns()
-            wakes[index] = _NEVER if wake_ns is None else wake_ns
-            if on_event is not None:
+            if wake_ns is None:
+                wake_ns = _NEVER
+            if wake_ns != wakes[index]:
+                wakes[index] = wake_ns
+                self._earliest_wake_ns = min(wakes)
+            if self._on_event is not None:
                 for event in take_events():
-                    on_event(index, event)
-        self._earliest_wake_ns = min(wakes)
+                    self._on_event(index, event)
 
     def _wake_due(self, now_ns: int) -> None:
         """Wake the nodes that are due, in their order, each until it wants nothing more at this instant."""

@@ -12,6 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from itertools import starmap
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self, cast
@@ -39,6 +40,8 @@ _MAX_ATTACHMENT_BYTES: Final = 1 << 26
 # 64 KiB of either; cut by count, so that the file does not depend on how the data came in
 _SAMPLES_A_CHUNK: Final = 384
 _FRAMES_A_CHUNK: Final = 1152
+_SINK_SAMPLES: Final = 1024
+"""So many samples are packed at once."""
 
 FRAME_SCHEMA: Final = """\
 # One CAN frame on the bus.
@@ -220,21 +223,18 @@ class RecordingSink:
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
-        self._pack = writer.layout.pack
-        self._packed = bytearray()
-        self._limit = 1024 * writer.layout.size
-        self._pack_frame = FRAME_STRUCT.pack
-        self._frames = bytearray()
+        self._samples: list[tuple[float, ...]] = []
+        self._frames: list[tuple[int, int, bool, int, bytes]] = []
 
     def append(self, *values: float) -> None:
         """Take one sample; see ``ring.Sink``."""
-        self._packed += self._pack(*values)
-        if len(self._packed) >= self._limit:
+        self._samples.append(values)
+        if len(self._samples) >= _SINK_SAMPLES:
             self.flush()
 
     def append_frame(self, at_ns: int, cob_id: int, data: bytes, is_remote: bool = False) -> None:
         """Take one CAN frame; see ``ring.Sink``."""
-        self._frames += self._pack_frame(at_ns, cob_id, is_remote, len(data), data)
+        self._frames.append((at_ns, cob_id, is_remote, len(data), data))
 
     def append_event(self, at_ns: int, kind: str, text: str, **data: str | int | float | bool | None) -> None:
         """Take one event; see ``ring.Sink``."""
@@ -242,11 +242,13 @@ class RecordingSink:
 
     def flush(self) -> None:
         """Hand everything to the writer; call it before the writer is closed."""
-        if self._packed:
-            self._writer.write_samples(np.frombuffer(bytes(self._packed), self._writer.layout.dtype))
-            self._packed.clear()
+        if self._samples:
+            packed = b"".join(starmap(self._writer.layout.pack, self._samples))
+            self._writer.write_samples(np.frombuffer(packed, self._writer.layout.dtype))
+            self._samples.clear()
         if self._frames:
-            self._writer.write_frames(np.frombuffer(bytes(self._frames), FRAME_DTYPE))
+            packed = b"".join(starmap(FRAME_STRUCT.pack, self._frames))
+            self._writer.write_frames(np.frombuffer(packed, FRAME_DTYPE))
             self._frames.clear()
 
 

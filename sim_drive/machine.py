@@ -169,6 +169,7 @@ class _Motor:
         "servo",
         "tap",
         "velocity",
+        "wake_ns",
     )
 
     def __init__(self, index: int, drive: MachineDrive, axis: MachineAxis) -> None:
@@ -184,6 +185,8 @@ class _Motor:
         """Counts/s, over the last servo period."""
         self.is_powered = False
         self.tap: DriveTap | None = None
+        self.wake_ns = _NEVER
+        """When the drive wants to be woken, as it was asked last."""
         # Looked up once: they are asked for at every frame and tick.
         self.receive = drive.receive
         self.next_wake_ns = drive.next_wake_ns
@@ -231,7 +234,6 @@ class EmulatedMachine:
         "_tick",
         "_tick_ns",
         "_torques",
-        "_wakes",
         "axes",
         "drives",
         "plant",
@@ -276,7 +278,6 @@ class EmulatedMachine:
         self._frames: list[Frame] = []
         self._events: list[Event] = []
         self._routes: dict[int, tuple[_Motor, ...]] = {}
-        self._wakes = [_NEVER] * count
         for motor in self._motors:
             motor.counts = motor.quantise(plant.angle(motor.index))
             motor.drive.latch = self._latch_of(motor)
@@ -328,7 +329,7 @@ class EmulatedMachine:
         for motor in listeners:
             motor.receive(frame, now_ns)
             self._ask_wake(motor)
-        self._exchange(now_ns)
+        self._listen(now_ns)
 
     def next_wake_ns(self) -> int | None:
         """The next servo tick or the next wake of a drive; never None, for the servo ticks never end."""
@@ -342,7 +343,8 @@ class EmulatedMachine:
             if self._due_ns == self._next_tick_ns:
                 self._run_tick(self._due_ns)
             else:
-                self._wake_drive(self._motors[self._wakes.index(self._due_ns)], self._due_ns)
+                due = next(motor for motor in self._motors if motor.wake_ns == self._due_ns)
+                self._wake_drive(due, self._due_ns)
 
     def take_frames(self) -> list[Frame]:
         """Frames of all drives in the order they were sent."""
@@ -362,12 +364,15 @@ class EmulatedMachine:
         wake_ns = motor.next_wake_ns()
         if wake_ns is None:
             wake_ns = _NEVER
-        if wake_ns != self._wakes[motor.index]:
+        if wake_ns != motor.wake_ns:
             self._set_wake(motor, wake_ns)
 
     def _set_wake(self, motor: _Motor, wake_ns: int) -> None:
-        self._wakes[motor.index] = wake_ns
-        self._due_ns = min(self._next_tick_ns, *self._wakes)
+        motor.wake_ns = wake_ns
+        self._find_due()
+
+    def _find_due(self) -> None:
+        self._due_ns = min(self._next_tick_ns, *[motor.wake_ns for motor in self._motors])
 
     def _wake_drive(self, motor: _Motor, due_ns: int) -> None:
         # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
@@ -375,7 +380,7 @@ class EmulatedMachine:
         for _ in range(_MAX_WAKES_PER_INSTANT):
             motor.drive.wake(at_ns)
             self._ask_wake(motor)
-            if self._wakes[motor.index] > at_ns:
+            if motor.wake_ns > at_ns:
                 break
         else:
             # A drive that always wants more at one instant must not stop the others: it goes on at the next tick.
@@ -390,7 +395,7 @@ class EmulatedMachine:
         self._tick += 1
         self._tick_ns = now_ns
         self._next_tick_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
-        self._due_ns = min(self._next_tick_ns, *self._wakes)
+        self._find_due()
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
         for motor in self._motors:
@@ -425,7 +430,7 @@ class EmulatedMachine:
             self._ask_wake(motor)
         if self.records.maxlen:
             self._record(now_ns)
-        self._exchange(now_ns)
+        self._listen(now_ns)
 
     def _power_on(self, motor: _Motor, demand_counts: float, now_ns: int) -> None:
         """The drive has switched its amplifier on since the tick before."""
@@ -434,6 +439,13 @@ class EmulatedMachine:
         if self._has_tripped:
             # Neither a fault reset nor switching the drive off and on mends a torn linkage.
             motor.drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
+
+    def _listen(self, now_ns: int) -> None:
+        """Let the drives hear each other if any of them has something to say."""
+        for motor in self._motors:
+            if motor.outbox or motor.events or motor.drive.subscriptions_changed:
+                self._exchange(now_ns)
+                return
 
     def _exchange(self, now_ns: int) -> None:
         """Collect what the drives have sent and noticed, and let them hear each other."""
@@ -510,8 +522,9 @@ class EmulatedMachine:
         self._tick_ns = self._start_ns + self._tick * TWO_SERVO_PERIODS_NS // 2
         self._next_tick_ns = self._start_ns + tick * TWO_SERVO_PERIODS_NS // 2
         # Wakes missed meanwhile are due once, now, not once for every period they have missed.
-        self._wakes = [max(wake_ns, self._next_tick_ns) for wake_ns in self._wakes]
-        self._due_ns = self._next_tick_ns
+        for motor in self._motors:
+            motor.wake_ns = max(motor.wake_ns, self._next_tick_ns)
+        self._find_due()
 
     def _record(self, now_ns: int) -> None:
         axes = range(len(self.drives))
