@@ -1,15 +1,24 @@
 """Builds the emulated machine that a configuration describes."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
+from config.loading import SHIPPED
 from config.schema import AxisSection, GatewayConfig
 from drivers.eds import load_eds
 from mechanism.cam_image import decode_cam_image
 from sim_drive.drive import Drive
 from sim_drive.machine import EmulatedMachine, MachineAxis
-from sim_drive.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, PlantParameters
 from sim_drive.settings import DriveIdentity, DriveSettings
+
+SHIPPED_EDS: Final = SHIPPED / "eds" / "sim_drive.eds"
+FREE_AXIS: Final = FreeAxisParameters(inertia_kg_m2=0.002, viscous_N_m_s=0.005, coulomb_N_m=0.05)
+"""What a drive of ``free_machine`` moves."""
+FREE_AXIS_GAINS: Final = (4000, 0, 0, 45_000, 45_000)
+"""3020h of a drive of ``free_machine``: the paper's, which suit the inertia."""
 
 SINGULAR_SHARE: Final = 0.5
 """The plant tears at this share of the transmission sine that the configuration keeps as its distance."""
@@ -37,6 +46,42 @@ def build_machine(config: GatewayConfig, seed: int = 0, start_ns: int = 0, recor
     theta2, theta5 = home_angles(config)
     plant = CoupledPlant(parameters, theta2, theta5)
     return EmulatedMachine(drives, plant, [_machine_axis(axis) for axis in axes], start_ns, seed, record_ticks)
+
+
+def free_machine(
+    node_ids: Sequence[int],
+    *,
+    settings: DriveSettings | None = None,
+    start_ns: int = 0,
+    seed: int = 0,
+    record_ticks: int = 0,
+) -> EmulatedMachine:
+    """Drives without a configuration, each on an axis of its own that is coupled to nothing, at 0 rad, brake engaged.
+
+    ``settings``: of every drive, save that each has its node id for a serial number; by default those of the EDS file
+    that ships, with gains that suit the axis. ``start_ns``, ``seed``, ``record_ticks``: see EmulatedMachine. Several
+    machines may share a bus, if all node ids on it differ.
+
+    Raises ValueError if a node id is not 1 to 127, or is given twice, or there is none.
+    """
+    if not node_ids:
+        raise ValueError("a machine needs a node")
+    for node_id in node_ids:
+        if node_ids.count(node_id) > 1:
+            raise ValueError(f"node id {node_id} is given twice, every node id must be unique")
+    common = DriveSettings(gains=FREE_AXIS_GAINS) if settings is None else settings
+    drives = [
+        Drive(
+            node_id,
+            load_eds(SHIPPED_EDS, node_id),
+            replace(common, identity=replace(common.identity, serial_number=node_id)),
+            decode_cam_image,
+        )
+        for node_id in node_ids
+    ]
+    axis = MachineAxis(common.counts_per_revolution, rated_torque_Nm=common.rated_torque_Nm)
+    plant = FreeAxisPlant([FREE_AXIS] * len(drives), [0.0] * len(drives))
+    return EmulatedMachine(drives, plant, [axis] * len(drives), start_ns, seed, record_ticks)
 
 
 def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
