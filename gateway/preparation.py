@@ -11,7 +11,7 @@ from config.conversion import desired_curve, five_bar, home_angles
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
 from gateway.commissioning import NetworkSettings, NodeSettings
-from gateway.core import AxisSetup, GatewayCore
+from gateway.core import START_WINDOW_COUNTS, AxisSetup, GatewayCore
 from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.demand import CamDemand
 from gateway.errors import GatewayError
@@ -23,6 +23,8 @@ from mechanism.errors import CamLimitError, MechanismError
 from mechanism.motion import MasterPlan, plan_run
 
 RAMP_GRID: Final = 4096
+WHOLE_REVOLUTION: Final = 1e-9
+"""Share of a revolution that is rounding, and asks for no revolution more."""
 NS_PER_US: Final = 1000
 
 
@@ -36,7 +38,7 @@ class PreparedRun:
     config: GatewayConfig
     cam: CompiledCam
     plan: MasterPlan
-    violations: tuple[MechanismError, ...]
+    violations: tuple[MechanismError | GatewayError, ...]
 
 
 def compile_config(config: GatewayConfig) -> CompiledCam:
@@ -73,37 +75,84 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
     Raises GatewayError with a sentence for every violation if ``is_strict``.
     """
     cam = compile_config(config)
-    violations = (*cam.violations, *_ramp_violations(config, cam.profile))
+    violations = (
+        *cam.violations,
+        *_ramp_violations(config, cam.profile),
+        *_home_violations(config, cam.profile),
+    )
     if is_strict and violations:
         raise GatewayError("\n".join(str(violation) for violation in violations))
     return PreparedRun(config, cam, plan(config, machine_cycles), violations)
 
 
 def plan(config: GatewayConfig, machine_cycles: int | None = None) -> MasterPlan:
-    """The master's plan: from home up to speed, the machine cycles, and down again to where it began."""
+    """The master's plan: from home up to speed, the machine cycles, and down again to the angle where it began.
+
+    Homing takes the position where the linkage stands for home, so that a run must end where the next one begins.
+    """
     motion = config.motion
-    return plan_run(
-        home_angles(config)[0],
-        config.speed_rad_per_s,
-        motion.machine_cycles if machine_cycles is None else machine_cycles,
-        motion.ramp_acceleration_rad_per_s2,
-        motion.ramp_jerk_rad_per_s3,
-    )
+    cycles = motion.machine_cycles if machine_cycles is None else machine_cycles
+    home = home_angles(config)[0]
+
+    def run(revolutions: float) -> MasterPlan:
+        return plan_run(
+            home,
+            config.speed_rad_per_s,
+            revolutions,
+            motion.ramp_acceleration_rad_per_s2,
+            motion.ramp_jerk_rad_per_s3,
+            end_at_multiple_of_revolution=False,
+        )
+
+    turned = (run(cycles).end_position - home) / math.tau
+    return run(cycles + math.ceil(turned - WHOLE_REVOLUTION) - turned)
 
 
 def _ramp_violations(config: GatewayConfig, profile: CamProfile) -> list[MechanismError]:
     """What the servo axis would exceed if the master ramped, or stopped, at any position of the cycle."""
-    slave = config.ordered_axes[1]
+    limits = config.ordered_axes[1].limits
     theta2 = np.linspace(0.0, math.tau, RAMP_GRID, endpoint=False)
-    motion = profile.at_many(theta2)
-    ramp = config.motion.ramp_acceleration_rad_per_s2
-    worst = np.abs(motion[:, 2]) * config.speed_rad_per_s**2 + np.abs(motion[:, 1]) * ramp
-    at = int(np.argmax(worst))
-    limit = slave.limits.acceleration_rad_per_s2
-    if worst[at] <= limit:
+    first, second, third = np.abs(profile.at_many(theta2)[:, 1:]).T
+    speed, ramp, jerk = (
+        config.speed_rad_per_s,
+        config.motion.ramp_acceleration_rad_per_s2,
+        config.motion.ramp_jerk_rad_per_s3,
+    )
+    found = [
+        ("acceleration", "rad/s^2", second * speed**2 + first * ramp, limits.acceleration_rad_per_s2),
+        (
+            "jerk",
+            "rad/s^3",
+            third * speed**3 + 3.0 * second * speed * ramp + first * jerk,
+            limits.jerk_rad_per_s3,
+        ),
+    ]
+    violations: list[MechanismError] = []
+    for name, unit, worst, limit in found:
+        at = int(np.argmax(worst))
+        if limit is not None and worst[at] > limit:
+            what = f"{name} while the master ramps at {ramp:g} rad/s^2"
+            violations.append(CamLimitError(what, float(worst[at]), limit, unit, float(theta2[at])))
+    return violations
+
+
+def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[GatewayError]:
+    """A homed slave stands at 0 counts, and the cam must have it there where the master is at home."""
+    slave = config.ordered_axes[1]
+    theta2, theta5 = home_angles(config)
+    on_cam = profile.at(theta2)[0]
+    distance = axis_units(slave).counts(on_cam)
+    if profile.net_turns:
+        distance = round(math.remainder(distance, slave.counts_per_revolution))
+    if slave.homing_method is None or abs(distance) <= START_WINDOW_COUNTS:
         return []
-    what = f"acceleration while the master ramps at {ramp:g} rad/s^2"
-    return [CamLimitError(what, float(worst[at]), limit, "rad/s^2", float(theta2[at]))]
+    name = config.axis_names[1]
+    return [
+        GatewayError(
+            f"axes.{name}.home_angle_deg: {math.degrees(theta5):g} is {abs(distance)} counts from the cam, which has "
+            f"{math.degrees(on_cam):.3f} deg where the master is at home (bound {START_WINDOW_COUNTS} counts)"
+        )
+    ]
 
 
 def axis_units(axis: AxisSection) -> AxisUnits:
