@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers import objects
-from drivers.errors import NodeError, SdoAbortedError
+from drivers.errors import NoAnswerError, NodeError, SdoAbortedError
 from drivers.master import Master, Procedure
 from drivers.nmt import NmtCommand
-from drivers.object_dictionary import DataType
+from drivers.object_dictionary import DataType, Value
 from drivers.pdo import (
     PDO_COB_ID_INVALID,
     PDO_COB_ID_NO_RTR,
@@ -20,6 +20,7 @@ from drivers.pdo import (
     TPDO_BASE,
     MappingEntry,
 )
+from drivers.sdo import AbortCode
 from gateway.errors import CommissioningError
 
 DEVICE_PROFILE_402: Final = 0x0192
@@ -96,6 +97,8 @@ def commission(master: Master, nodes: Sequence[NodeSettings], network: NetworkSe
     yield from for_all(nodes, lambda node: write_parameters(master, node, network))
     yield from for_all(nodes, lambda node: map_pdos(master, node))
     yield from for_all(nodes, lambda node: set_up_heartbeats(master, node, network))
+    since_ns = master.now_ns
+    yield from for_all(nodes, lambda node: hear_heartbeat(master, node, network, since_ns))
 
 
 def check_identity(master: Master, node: NodeSettings) -> Procedure[None]:
@@ -122,7 +125,7 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
     value, exponent = network.interpolation_time
     yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 1, U8, value)
     yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 2, I8, exponent)
-    yield from master.write(node_id, objects.COMMUNICATION_CYCLE_PERIOD, 0, U32, network.cycle_us)
+    yield from _write_if_there(master, node_id, objects.COMMUNICATION_CYCLE_PERIOD, U32, network.cycle_us)
     yield from master.write(node_id, objects.FOLLOWING_ERROR_WINDOW, 0, U32, node.following_error_window)
     rated = yield from master.read_int(node_id, objects.MOTOR_RATED_TORQUE, 0, U32)
     increments = yield from master.read_int(node_id, objects.POSITION_ENCODER_RESOLUTION, 1, U32)
@@ -139,6 +142,15 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
         )
     if problems:
         raise CommissioningError(problems)
+
+
+def _write_if_there(master: Master, node_id: int, index: int, data_type: DataType, value: Value) -> Procedure[None]:
+    """Write an object that the standard leaves optional; one that is there, and refuses the value, is a fault."""
+    try:
+        yield from master.write(node_id, index, 0, data_type, value)
+    except SdoAbortedError as error:
+        if error.code != AbortCode.OBJECT_DOES_NOT_EXIST:
+            raise
 
 
 def map_pdos(master: Master, node: NodeSettings) -> Procedure[None]:
@@ -196,6 +208,15 @@ def set_up_heartbeats(master: Master, node: NodeSettings, network: NetworkSettin
     yield from master.write(node_id, objects.CONSUMER_HEARTBEAT_TIME, 1, U32, consumer)
     yield from master.write(node_id, objects.PRODUCER_HEARTBEAT_TIME, 0, U16, network.heartbeat_ms)
     master.watch_heartbeat(node_id, network.heartbeat_timeout_ms / 1000.0)
+
+
+def hear_heartbeat(master: Master, node: NodeSettings, network: NetworkSettings, since_ns: int) -> Procedure[None]:
+    """Go on only with a drive whose heartbeat has been heard: one that sends none could fall silent unnoticed."""
+    remote = master.nodes[node.node_id]
+    timeout_s = network.heartbeat_timeout_ms / 1000.0
+    heard = yield from master.wait_for(lambda: remote.heartbeat_at_ns > since_ns, timeout_s)
+    if not heard:
+        raise NoAnswerError(node.node_id, "its heartbeat", timeout_s)
 
 
 def release_heartbeat(master: Master, node: NodeSettings) -> Procedure[None]:

@@ -242,9 +242,32 @@ def test_a_drive_that_sends_no_tpdo_is_refused():
     assert_refused(session, "axis servo: no TPDO 182h arrives after SYNC")
 
 
+def test_a_drive_whose_heartbeat_never_comes_is_refused_before_any_is_enabled():
+    """Its boot-up message apart, which has the same COB-ID."""
+    session = Session(faults=Dropping(SERVO_HEARTBEAT, 2_000_000, 100 * SECOND))
+    assert_refused(session, "axis servo: node 2: no answer within 0.2 s while waiting for its heartbeat")
+    assert 0x080 not in {frame.cob_id for _, frame in session.frames}
+
+
+def test_a_run_from_another_home_ends_there():
+    """Homed on the current position, the next run takes the place where this one ended for its home."""
+    theta5_deg = math.degrees(prepare(PAPER).cam.profile.at(math.pi / 2)[0])
+    master, slave = PAPER.text.split("  servo:\n")
+    master = master.replace("home_angle_deg: 0.0", "home_angle_deg: 90.0")
+    slave = slave.replace("home_angle_deg: 0.0", f"home_angle_deg: {theta5_deg}")
+    session = Session(parse_config(master + "  servo:\n" + slave, PAPER.path)).to_end()
+    assert session.core.stopped_by is StopReason.COMPLETED
+    # Three revolutions: the cycle asked for, and two for the ramps.
+    assert math.degrees(session.machine.plant.angle(0)) == pytest.approx(90.0 + 3 * 360.0, abs=2.0)
+    assert math.degrees(session.machine.plant.angle(1)) == pytest.approx(theta5_deg, abs=2.0)
+
+
 def test_a_cam_that_starts_elsewhere_is_refused():
     master, slave = PAPER.text.split("  servo:\n")
-    text = master + "  servo:\n" + slave.replace("home_angle_deg: 0.0", "home_angle_deg: 5.0")
+    slave = slave.replace("home_angle_deg: 0.0", "home_angle_deg: 5.0").replace(
+        "homing_method: 37", "homing_method: null"
+    )
+    text = master + "  servo:\n" + slave
     session = Session(parse_config(text, PAPER.path), PAPER)
     assert_refused(session, "axis servo: stands at 0 counts, the cam starts at -57, which is more than 20 counts away")
 
