@@ -14,6 +14,8 @@ class BusAddress:
     channel: str
     host: str
     port: int
+    bit_rate: int | None = None
+    """For interfaces that set it themselves; None leaves it to python-can. A SocketCAN interface has its own."""
 
     def __str__(self) -> str:
         if self.interface == "socketcand":
@@ -22,7 +24,8 @@ class BusAddress:
 
     def open(self, filters: list[tuple[int, int]] | None = None) -> Port:
         """Open the bus. Raises drivers.errors.BusError."""
-        return open_port(self.interface, self.channel, host=self.host, port=self.port, filters=filters)
+        options = {} if self.bit_rate is None else {"bitrate": self.bit_rate}
+        return open_port(self.interface, self.channel, host=self.host, port=self.port, filters=filters, **options)
 
 
 def resolve_bus(
@@ -36,4 +39,4 @@ def resolve_bus(
     chosen = interface or bus.interface
     if chosen == "auto":
         chosen = "socketcan" if interface_is_up(chosen_channel) else "socketcand"
-    return BusAddress(chosen, chosen_channel, bus.host, bus.port if port is None else port)
+    return BusAddress(chosen, chosen_channel, bus.host, bus.port if port is None else port, bus.bit_rate)

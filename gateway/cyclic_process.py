@@ -4,9 +4,7 @@ It writes samples and events into the ring that the parent has made, takes stop 
 session. It outlives nobody: a parent that dies is a request for a controlled stop.
 """
 
-import ctypes
 import json
-import os
 import signal
 import sys
 import time
@@ -22,6 +20,7 @@ from drivers.node import Event
 from drivers.ports import Port
 from drivers.real_time import try_realtime
 from gateway.bus_address import BusAddress
+from gateway.child_process import end_with
 from gateway.core import GatewayCore
 from gateway.event_text import describe
 from gateway.guard import StopReason
@@ -30,7 +29,6 @@ from gateway.ring import RingWriter, RunState, StopRequest
 from mechanism.cam_file import parse_cam_file
 
 MAX_WAIT_S: Final = 0.05
-PR_SET_PDEATHSIG: Final = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +44,7 @@ class CyclicJob:
     channel: str
     host: str
     port: int
+    bit_rate: int | None
     parent_pid: int
     is_homing_again: bool = False
 
@@ -55,7 +54,7 @@ class CyclicJob:
 
 
 def run_core(core: GatewayCore, port: Port, clock: Callable[[], int], poll: Callable[[], None]) -> None:
-    """Drive the gateway's core by the clock until it is done; ``poll`` is called once a cycle.
+    """Drive the gateway's core by the clock until it is done; ``poll`` is called at least once a cycle.
 
     Unlike the emulator's host, which gives every wake the instant it was due, this one tells the core the time that it
     really is: the gateway's account is about how late things are.
@@ -88,16 +87,22 @@ def run_core(core: GatewayCore, port: Port, clock: Callable[[], int], poll: Call
             for frame in frames:
                 port.send(frame)
             loop.sent(clock())
+            # A loop that is always late never waits, and must hear of a stop all the same.
+            poll()
 
 
-def _stop_with_parent(parent_pid: int) -> None:
-    """Ask the kernel for a SIGTERM when the parent dies, however it dies."""
-    try:
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
-    except (OSError, AttributeError):
-        return
-    if os.getppid() != parent_pid:
-        os.kill(os.getpid(), signal.SIGTERM)
+def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
+    """Hand a stop request to the core, once: a quick stop asked for again would undo the disabling that follows it.
+
+    ``answered`` is what was handed on before; returns what has been handed on now.
+    """
+    if request <= answered:
+        return answered
+    if request >= StopRequest.QUICK_STOP:
+        core.request_quick_stop()
+    else:
+        core.request_stop()
+    return request
 
 
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
@@ -111,24 +116,22 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         ring.request_stop(StopRequest.CONTROLLED_STOP)
 
     signal.signal(signal.SIGTERM, on_terminate)
-    _stop_with_parent(job.parent_pid)
+    signal.signal(signal.SIGHUP, on_terminate)
+    end_with(job.parent_pid)
+    answered = int(StopRequest.NONE)
 
     def on_event(event: Event) -> None:
         kind, text, data = describe(event)
         ring.append_event(event.at_ns, kind, text, source="gateway", **data)
 
     def poll() -> None:
+        nonlocal answered
         for event in core.take_events():
             on_event(event)
         ring.beat(time.monotonic_ns())
-        request = ring.stop_request()
-        if request:
-            if request >= StopRequest.QUICK_STOP:
-                core.request_quick_stop()
-            else:
-                core.request_stop()
+        answered = pass_on_stop(core, ring.stop_request(), answered)
 
-    address = BusAddress(job.interface, job.channel, job.host, job.port)
+    address = BusAddress(job.interface, job.channel, job.host, job.port, job.bit_rate)
     port: Port | None = None
     stopped_by = StopReason.BUS_LOST
     try:
@@ -143,7 +146,6 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
             )
         ring.set_state(RunState.RUNNING)
         run_core(core, port, time.monotonic_ns, poll)
-        poll()
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:
@@ -151,6 +153,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     finally:
         if port is not None:
             port.close()
+    poll()
     if failure is not None:
         for sentence in str(failure).splitlines():
             ring.append_event(time.monotonic_ns(), "failure", sentence)

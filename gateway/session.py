@@ -1,6 +1,7 @@
 """A run in real time, as its parent sees it: the ring, the cyclic process, the recorder, and what comes of them."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -14,6 +15,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Final
 
+from drivers.errors import BusError
+from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
+from drivers.ports import Port
 from gateway.bus_address import BusAddress
 from gateway.cyclic_process import CyclicJob
 from gateway.errors import GatewayError
@@ -24,7 +28,11 @@ from gateway.run_constants import RunConstants
 POLL_S: Final = 0.1
 RECORDER_TIMEOUT_S: Final = 30.0
 PROCESS_TIMEOUT_S: Final = 15.0
-"""How long the cyclic process may take to end after a stop, before it is terminated."""
+"""How long the cyclic process may take to end when it is not watched any more, before it is terminated."""
+HUNG_S: Final = 3.0
+"""A running cyclic process that has given no sign of life for so long is killed: the drives then stop by themselves."""
+LISTENING_S: Final = 0.1
+"""How long the bus is listened to at least before anything is sent on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,19 +50,28 @@ class Progress:
 
 
 class StopSwitch:
-    """SIGINT and SIGTERM as stop requests: the first asks for a controlled stop, the second for a quick stop."""
+    """Signals as stop requests: the first SIGINT or SIGTERM asks for a controlled stop, the second for a quick stop.
+
+    SIGHUP, a terminal that was closed, asks for a controlled stop however often it comes.
+    """
 
     def __init__(self) -> None:
         self.request = StopRequest.NONE
 
     def press(self, _number: int = 0, _frame: FrameType | None = None) -> None:
         """Ask for a stop, or for a stronger one."""
-        self.request = StopRequest.CONTROLLED_STOP if self.request is StopRequest.NONE else StopRequest.QUICK_STOP
+        if self.request is StopRequest.NONE:
+            self.request = StopRequest.CONTROLLED_STOP
+        elif _number != signal.SIGHUP:
+            self.request = StopRequest.QUICK_STOP
 
     @contextmanager
     def installed(self) -> Generator[None]:
         """While this lasts the signals press the switch."""
-        before = {number: signal.signal(number, self.press) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        # Who was started under nohup has been promised to outlive the terminal.
+        numbers += [] if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN else [signal.SIGHUP]
+        before = {number: signal.signal(number, self.press) for number in numbers}
         try:
             yield
         finally:
@@ -67,6 +84,23 @@ def _python_environment() -> dict[str, str]:
     root = str(Path(__file__).resolve().parent.parent)
     known = os.environ.get("PYTHONPATH", "")
     return {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in (root, known) if part)}
+
+
+def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None:
+    """Listen for ``span_s``, and refuse a bus that somebody else commands: two masters reset each other's drives.
+
+    Raises GatewayError, and BusError when the bus goes away.
+    """
+    telltales = {SYNC_COB_ID: "SYNC", HEARTBEAT_BASE + gateway_node_id: f"the heartbeat of node {gateway_node_id}"}
+    end_s = time.monotonic() + span_s
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        received = port.receive()
+        if received is None:
+            port.wait(left_s)
+            continue
+        sign = telltales.get(received[0].cob_id)
+        if sign is not None:
+            raise GatewayError(f"somebody else commands this bus: {sign} is on it, is another run going on?")
 
 
 def run_realtime(
@@ -91,8 +125,12 @@ def run_realtime(
     config = prepared.config
     constants = RunConstants.from_config(config, prepared.cam.closure)
     failures: list[str] = []
-    # A bus that is not there is told before a recording is begun.
-    address.open().close()
+    # A bus that is not there, or not free, is told before a recording is begun.
+    port = address.open()
+    try:
+        refuse_other_master(port, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
+    finally:
+        port.close()
     start_ns = time.monotonic_ns()
     start_wall_ns = time.time_ns()
     with RingWriter.create(config.name, constants) as ring, tempfile.TemporaryDirectory() as folder:
@@ -112,6 +150,8 @@ def run_realtime(
             stderr=subprocess.PIPE,
             env=environment,
             text=True,
+            # Signals of the terminal are for this process, who stops the run in order.
+            start_new_session=True,
         )
         job = CyclicJob(
             ring=str(ring.path),
@@ -123,6 +163,7 @@ def run_realtime(
             channel=address.channel,
             host=address.host,
             port=address.port,
+            bit_rate=address.bit_rate,
             parent_pid=os.getpid(),
             is_homing_again=is_homing_again,
         )
@@ -132,26 +173,33 @@ def run_realtime(
             stderr=subprocess.PIPE,
             env=environment,
             text=True,
+            start_new_session=True,
         )
         try:
             if loop.stdin is not None:
-                loop.stdin.write(job.to_json())
-                loop.stdin.close()
+                # A process that has died already is told of below.
+                with suppress(BrokenPipeError):
+                    loop.stdin.write(job.to_json())
+                with suppress(BrokenPipeError):
+                    loop.stdin.close()
                 # Else communicate() would flush it once more.
                 loop.stdin = None
             with RingReader(ring.path) as reader:
                 _follow(loop, recorder, reader, prepared, start_ns, switch, failures, on_progress, on_event)
         finally:
+            if loop.poll() is None:
+                ring.request_stop(StopRequest.CONTROLLED_STOP)
             loop_errors = _end(loop, PROCESS_TIMEOUT_S)
-        if loop.returncode not in (0, 1) or (loop.returncode == 1 and not failures):
-            last = loop_errors.strip().splitlines()[-1:] or ["nothing on stderr"]
-            failures.append(f"the cyclic process ended with status {loop.returncode} ({last[0]})")
+        if loop.returncode not in (0, 1):
             # Nobody else will say so to the recorder, which otherwise waits for the writer that this process is.
             ring.set_state(RunState.FAILED, 1)
+        if loop.returncode != 0 and not failures:
+            failures.append(f"the cyclic process {_ending(loop.returncode, loop_errors)}")
         recorder_errors = _end(recorder, RECORDER_TIMEOUT_S)
         if recorder.returncode != 0:
             last = recorder_errors.strip().splitlines()[-1:] or ["nothing on stderr"]
-            failures.append(last[0] if recorder.returncode == 2 else f"the recorder died: {last[0]}")
+            ending = _ending(recorder.returncode, recorder_errors)
+            failures.append(last[0] if recorder.returncode == 2 else f"the recorder {ending}")
     if failures:
         raise GatewayError("\n".join(failures))
 
@@ -170,7 +218,7 @@ def _follow(
     """Watch the run until the cyclic process ends; hand on stops, events and progress."""
     step = "starting"
     turns = 0.0
-    total = (prepared.plan.end_position - prepared.plan.at(0.0)[0]) / 6.283185307179586
+    total = (prepared.plan.end_position - prepared.plan.at(0.0)[0]) / math.tau
     first: float | None = None
     is_recorder_lost = False
     while True:
@@ -187,7 +235,7 @@ def _follow(
         if len(samples):
             position = float(samples["master_position"][-1])
             first = position if first is None else first
-            turns = abs(position - first) / 6.283185307179586
+            turns = abs(position - first) / math.tau
         for event in reader.read_new_events()[0]:
             kind, text = str(event.data.get("kind")), str(event.data.get("text"))
             if kind == "step":
@@ -196,10 +244,29 @@ def _follow(
                 failures.append(text)
             if on_event is not None:
                 on_event(dict(event.data))
+        if not is_over and _is_hung(reader):
+            failures.append(f"the cyclic process gave no sign of life for {HUNG_S:g} s and was killed")
+            loop.kill()
+            loop.wait()
         if on_progress is not None:
             on_progress(Progress((time.monotonic_ns() - start_ns) * 1e-9, step, turns, total))
         if is_over:
             return
+
+
+def _is_hung(reader: RingReader) -> bool:
+    """Whether the loop runs, has shown signs of life, and shows them no more."""
+    heartbeat_ns = reader.heartbeat_ns
+    silent_s = (time.monotonic_ns() - heartbeat_ns) * 1e-9
+    return reader.state is RunState.RUNNING and heartbeat_ns > 0 and silent_s > HUNG_S
+
+
+def _ending(status: int, errors: str) -> str:
+    """How a child ended: by which signal, or with which status and what it said last."""
+    if status < 0:
+        return f"was ended by {signal.Signals(-status).name}"
+    last = errors.strip().splitlines()[-1:] or ["nothing on stderr"]
+    return f"ended with status {status} ({last[0]})"
 
 
 def _end(process: "subprocess.Popen[str]", timeout_s: float) -> str:
@@ -232,7 +299,8 @@ def emulator_process(
     """
     with tempfile.TemporaryDirectory() as folder:
         ready = Path(folder, "ready.json")
-        command = [sys.executable, "-m", "sim_drive", str(config_path), "--port", "0"]
+        command = [sys.executable, "-m", "gateway.child_process", str(os.getpid())]
+        command += ["sim_drive", str(config_path), "--port", "0"]
         command += ["--ready-file", str(ready), "--seed", str(seed), "--realtime"]
         command += ["--interface", interface] if interface else []
         command += ["--channel", channel] if channel else []
@@ -256,7 +324,15 @@ def emulator_process(
                     on_wait(waited)
                 time.sleep(0.05)
             place = json.loads(ready.read_text())
-            yield BusAddress(place["interface"], place["channel"], place.get("host") or "", int(place.get("port") or 0))
+            try:
+                yield BusAddress(
+                    place["interface"], place["channel"], place.get("host") or "", int(place.get("port") or 0)
+                )
+            except (GatewayError, BusError) as error:
+                if process.poll() is None:
+                    raise
+                ending = _ending(process.returncode, _end(process, 0.1))
+                raise GatewayError(f"{error}\nthe emulated machine {ending}") from None
         finally:
             if process.poll() is None:
                 process.send_signal(signal.SIGTERM)
