@@ -1,6 +1,7 @@
 """Commands that move a machine, real or emulated: run, demo."""
 
 import json
+import math
 import sys
 import time
 from collections.abc import Generator
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from config.schema import GatewayConfig
     from gateway.bus_address import BusAddress
     from gateway.preparation import PreparedRun
+    from gateway.recording import Recording
 
 RUN_EPILOG = """Examples:
 
@@ -174,8 +176,22 @@ def _run_virtually(
     return reached_s / (time.monotonic() - started)
 
 
-def _show(recording: Path, as_json: bool, report_folder: Path | None) -> None:
-    """Print the figures of a recording, write the report if asked, and end with 1 if the machine was stopped early."""
+def _where_the_machine_stands(read: "Recording") -> str:
+    """Angles of the axes at a recording's end; nothing if they never left home."""
+    from gateway.analysis import prepare
+
+    data = prepare(read.samples, read.constants)
+    if not data.is_following.any():
+        return ""
+    angles = zip(read.constants.axis_names, data.angle_rad[-1], strict=True)
+    return ", ".join(f"{name} at {math.degrees(angle) % 360.0:.1f} deg" for name, angle in angles)
+
+
+def _show(recording: Path, as_json: bool, report_folder: Path | None, is_machine_left: bool = False) -> None:
+    """Print the figures of a recording, write the report if asked, and end with 1 if the machine was stopped early.
+
+    ``is_machine_left``: the machine stays where the run left it, and the next run must not take that for home.
+    """
     from gateway.analysis import analyse
     from gateway.guard import StopReason
     from gateway.recording import read_recording
@@ -183,6 +199,8 @@ def _show(recording: Path, as_json: bool, report_folder: Path | None) -> None:
     from gateway.report_text import render_report
 
     read = read_recording(recording)
+    if not len(read.samples):
+        complain([f"the run ended before its first cycle, it was stopped by: {read.stopped_by}"], EXIT_NO)
     figures = analyse(read)
     written = write_report(recording, report_folder) if report_folder is not None else []
     if as_json:
@@ -194,7 +212,10 @@ def _show(recording: Path, as_json: bool, report_folder: Path | None) -> None:
         if path.name == "report.html":
             console.print(f"report: {path}", soft_wrap=True, markup=False)
     if read.stopped_by != StopReason.COMPLETED.value:
-        complain([f"the run did not complete, it was stopped by: {read.stopped_by}"], EXIT_NO)
+        sentences = [f"the run did not complete, it was stopped by: {read.stopped_by}"]
+        if is_machine_left and (where := _where_the_machine_stands(read)):
+            sentences.append(f"the linkage stands with {where}: bring it home before the next run")
+        complain(sentences, EXIT_NO)
 
 
 def run(
@@ -233,7 +254,7 @@ def run(
         count = settings.motion.machine_cycles if cycles is None else cycles
         address = resolve_bus(settings.bus, interface, channel, port)
         _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here)
-    _show(recording, as_json, None)
+    _show(recording, as_json, None, is_machine_left=not virtual_time)
 
 
 def demo(

@@ -33,6 +33,7 @@ def report(
 ) -> None:
     """Make the report of a recording: tables here, report.html, report.json and plots in DIR."""
     from gateway.analysis import analyse
+    from gateway.errors import GatewayError
     from gateway.recording import read_recording, write_candump_log
     from gateway.report import write_report
     from gateway.report_text import render_report
@@ -41,7 +42,10 @@ def report(
     figures = analyse(read)
     written = write_report(recording, output)
     if candump is not None:
-        write_candump_log(read.frames(), candump)
+        frames = read.frames()
+        if not len(frames):
+            raise GatewayError(f"recording {recording}: holds no CAN frames to export (run with --frames records them)")
+        write_candump_log(frames, candump)
     if as_json:
         print_json(figures.to_json())
     else:
