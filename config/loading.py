@@ -3,7 +3,7 @@
 from collections.abc import Hashable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Any, Final, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -15,6 +15,8 @@ from config.schema import GatewayConfig
 
 SHIPPED: Final = Path(__file__).parent
 MAX_FILE_BYTES: Final = 1 << 20
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class ConfigError(Exception):
@@ -61,18 +63,30 @@ def find_config(name: str) -> Path:
 def load_config(name: str) -> GatewayConfig:
     """The configuration in the file ``name``, or the shipped one so called. Raises ConfigError."""
     path = find_config(name)
+    return parse_config(read_text(path), path)
+
+
+def read_text(path: Path) -> str:
+    """The text of a file that people write, so of a bounded length. Raises ConfigError."""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise ConfigError([f"{path}: larger than {MAX_FILE_BYTES} bytes"])
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise ConfigError([f"{path}: cannot be read ({reason})"]) from None
-    return parse_config(text, path)
 
 
 def parse_config(text: str, path: Path) -> GatewayConfig:
     """The configuration that ``text`` says; ``path`` is where it came from. Raises ConfigError."""
+    config = parse_model(text, path, GatewayConfig)
+    config._path = path
+    config._text = text
+    return config
+
+
+def parse_model(text: str, path: Path, model: type[ModelT]) -> ModelT:
+    """The ``model`` that the YAML ``text`` says; ``path`` is where it came from. Raises ConfigError."""
     try:
         document = yaml.load(text, Loader=_Loader)  # noqa: S506 -- derived from SafeLoader
     except yaml.MarkedYAMLError as error:
@@ -83,20 +97,18 @@ def parse_config(text: str, path: Path) -> GatewayConfig:
     if not isinstance(document, dict):
         raise ConfigError([f"{path}: holds no mapping at its top level"])
     try:
-        config = GatewayConfig.model_validate(document)
+        return model.model_validate(document)
     except ValidationError as error:
-        raise ConfigError([f"{path}: {_sentence(details)}" for details in error.errors()]) from None
-    config._path = path
-    config._text = text
-    return config
+        raise ConfigError([f"{path}: {sentence(details, model)}" for details in error.errors()]) from None
 
 
-def _sentence(details: ErrorDetails) -> str:
+def sentence(details: ErrorDetails, model: type[BaseModel]) -> str:
+    """What is wrong with one key of a ``model``: key, value, bound, and for an unknown key the nearest known one."""
     key = ".".join(str(part) for part in details["loc"])
     value = details["input"]
     kind = details["type"]
     if kind == "extra_forbidden":
-        return f"{key}: unknown key{_suggestion(details['loc'])}"
+        return f"{key}: unknown key{_suggestion(details['loc'], model)}"
     if kind == "missing":
         return f"{key}: required key is missing"
     if kind == "value_error":
@@ -107,20 +119,22 @@ def _sentence(details: ErrorDetails) -> str:
     return f"{key}: {shown[:80]} {message}"
 
 
-def _suggestion(location: tuple[int | str, ...]) -> str:
+def _suggestion(location: tuple[int | str, ...], model: type[BaseModel]) -> str:
     """The known key that is nearest to an unknown one; a unit suffix that differs is pointed out."""
-    known = _keys_at(location[:-1])
+    known = _keys_at(location[:-1], model)
     unknown = str(location[-1])
     same_stem = [key for key in known if key.split("_")[0] == unknown.split("_")[0] and key != unknown]
     close = get_close_matches(unknown, known, n=1, cutoff=0.6) or same_stem[:1]
     return f", did you mean {close[0]}?" if close else ""
 
 
-def _keys_at(location: tuple[int | str, ...]) -> list[str]:
-    model: type[BaseModel] | None = GatewayConfig
+def _keys_at(location: tuple[int | str, ...], root: type[BaseModel]) -> list[str]:
+    model: type[BaseModel] | None = root
     for part in location:
-        if model is None or not isinstance(part, str):
+        if model is None:
             return []
+        if isinstance(part, int):  # a place in a list of models
+            continue
         field = model.model_fields.get(part)
         if field is None:  # a key of a dictionary of models, such as an axis' name
             continue
