@@ -1,23 +1,27 @@
 """EMCY producer (CiA 301, 7.2.7) with the error register 1001h and the pre-defined error field 1003h."""
 
 import struct
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag, unique
 from typing import Final
 
 from drivers.frame import Frame
 from drivers.node import Event
-from drivers.objects import COB_ID_EMCY, ERROR_CODE, ERROR_REGISTER, PREDEFINED_ERROR_FIELD
+from drivers.objects import COB_ID_EMCY, ERROR_CODE, ERROR_REGISTER, INHIBIT_TIME_EMCY, PREDEFINED_ERROR_FIELD
 from drivers.pdo import PDO_COB_ID_INVALID
 from drivers.sdo import AbortCode
+from sim_drive.cob_ids import COB_ID_MASK, is_refused
 from sim_drive.dictionary import Entry, LiveDictionary
 
 ERROR_HISTORY_LENGTH: Final = 8
 """Errors that 1003h remembers."""
 
 _EMCY: Final = struct.Struct("<HB5s")
-_COB_ID_MASK: Final = 0x7FF
-_EXTENDED_FRAME: Final = 1 << 29
+_INHIBIT_UNIT_NS: Final = 100_000
+_MAX_HELD_BACK: Final = 16
+"""EMCY frames that wait for the inhibit time to pass; the oldest give way to more."""
 
 
 @unique
@@ -25,6 +29,8 @@ class EmergencyCode(IntEnum):
     """Emergency error codes that the drive raises by itself (CiA 301, table 26; CiA 402-1; FF00h: our own)."""
 
     NO_ERROR = 0x0000
+    PARAMETERS_LOST = 0x6310
+    """What was stored by 1010h cannot be used, and the drive has its default values."""
     COMMUNICATION = 0x8100
     """The NMT master has stopped the node, or reset its communication, while the axis was enabled."""
     HEARTBEAT = 0x8130
@@ -78,12 +84,16 @@ class EmergencyProducer:
         "_cob_id",
         "_code",
         "_events",
+        "_free_at_ns",
+        "_held_back",
         "_history",
+        "_inhibit_time",
+        "_is_silent",
         "_node_id",
         "_outbox",
         "_register",
         "has_errors",
-        "is_silent",
+        "on_held_back",
     )
 
     def __init__(self, node_id: int, dictionary: LiveDictionary, outbox: list[Frame], events: list[Event]) -> None:
@@ -99,10 +109,35 @@ class EmergencyProducer:
         self._history[0].on_write = self._on_history_cleared
         for number, entry in enumerate(self._history[1:], start=1):
             entry.on_read = self._history_reader(number, entry)
+        self._inhibit_time = dictionary.entry(INHIBIT_TIME_EMCY)
+        self._held_back: deque[Frame] = deque(maxlen=_MAX_HELD_BACK)
+        self._free_at_ns = 0
+        self._is_silent = True
         self.has_errors = False
         """Whether any error is active."""
-        self.is_silent = True
+        self.on_held_back: Callable[[], None] = _no_matter
+        """Called when ``next_wake_ns`` may have become earlier."""
+
+    @property
+    def is_silent(self) -> bool:
         """No EMCY is sent, as before the boot-up and in NMT state stopped; errors are still remembered."""
+        return self._is_silent
+
+    @is_silent.setter
+    def is_silent(self, is_silent: bool) -> None:
+        self._is_silent = is_silent
+        if is_silent:
+            self._held_back.clear()
+
+    def next_wake_ns(self) -> int | None:
+        """When the inhibit time lets the next EMCY go."""
+        return self._free_at_ns if self._held_back else None
+
+    def wake(self, now_ns: int) -> None:
+        """Send what the inhibit time has let go."""
+        if self._held_back and now_ns >= self._free_at_ns:
+            self._outbox.append(self._held_back.popleft())
+            self._free_at_ns = now_ns + self._inhibit_time.value * _INHIBIT_UNIT_NS
 
     @property
     def has_persisting_fault(self) -> bool:
@@ -115,6 +150,7 @@ class EmergencyProducer:
 
     def restore(self) -> None:
         """Bring 1001h and 603Fh up to date after the dictionary's defaults were restored."""
+        self._free_at_ns = 0
         self._register.value = self._combined_register()
         self._code.value = next(reversed(self._active), int(EmergencyCode.NO_ERROR))
 
@@ -179,13 +215,20 @@ class EmergencyProducer:
         self._register.value = register
         self._events.append(EmergencyRaised(now_ns, self._node_id, code, register))
         cob_id = self._cob_id.value
-        if not self.is_silent and not cob_id & PDO_COB_ID_INVALID:
-            self._outbox.append(Frame(cob_id & _COB_ID_MASK, _EMCY.pack(code, register, b"\0\0\0\0\0")))
+        if self._is_silent or cob_id & PDO_COB_ID_INVALID:
+            return
+        frame = Frame(cob_id & COB_ID_MASK, _EMCY.pack(code, register, b"\0\0\0\0\0"))
+        if now_ns < self._free_at_ns or self._held_back:
+            self._held_back.append(frame)
+            self.on_held_back()
+        else:
+            self._outbox.append(frame)
+            self._free_at_ns = now_ns + self._inhibit_time.value * _INHIBIT_UNIT_NS
 
     def _on_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
-        current = self._cob_id.value
-        is_moved = (value ^ current) & _COB_ID_MASK and not (current | value) & PDO_COB_ID_INVALID
-        if value & _EXTENDED_FRAME or is_moved or not value & _COB_ID_MASK:
+        # Bit 31 says that the object does not exist; turned round, that it does.
+        exists = value ^ PDO_COB_ID_INVALID
+        if is_refused(exists, self._cob_id.value ^ PDO_COB_ID_INVALID, PDO_COB_ID_INVALID):
             return AbortCode.VALUE_RANGE_EXCEEDED
         return None
 
@@ -201,3 +244,7 @@ class EmergencyProducer:
             return entry.value if number <= self._history[0].value else AbortCode.NO_DATA_AVAILABLE
 
         return read
+
+
+def _no_matter() -> None:
+    pass

@@ -74,10 +74,10 @@ class HeartbeatConsumer:
     def __init__(
         self,
         dictionary: LiveDictionary,
-        on_change: Callable[[int, bool, int], None],
+        on_change: Callable[[bool, int], None],
         on_subscription: Callable[[], None],
     ) -> None:
-        """``on_change(node_id, is_lost, now_ns)``: a watched node has fallen silent, or is back.
+        """``on_change(is_lost, now_ns)``: a watched node has fallen silent, or all of them are back.
 
         ``on_subscription()``: the set of ``node_ids`` has changed.
         """
@@ -95,6 +95,11 @@ class HeartbeatConsumer:
     def node_ids(self) -> Sequence[int]:
         """Nodes that are watched."""
         return [guard.node_id for guard in self._guards if guard.timeout_ns]
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether a watched node has fallen silent, and is not back."""
+        return any(guard.is_lost for guard in self._guards)
 
     def restore(self) -> None:
         """Begin anew with what 1016h holds; no node has been heard of."""
@@ -131,13 +136,13 @@ class HeartbeatConsumer:
             guard.deadline_ns = now_ns + guard.timeout_ns
             if guard.is_lost:
                 guard.is_lost = False
-                if not any(other.is_lost for other in self._guards):
-                    self._on_change(node_id, False, now_ns)
+                if not self.has_lost:
+                    self._on_change(False, now_ns)
 
     def _lose(self, guard: _Guard, now_ns: int) -> None:
         guard.deadline_ns = None
         guard.is_lost = True
-        self._on_change(guard.node_id, True, now_ns)
+        self._on_change(True, now_ns)
 
     def _configure(self, guard: _Guard, value: int) -> None:
         guard.node_id = value >> 16 & 0xFF
@@ -156,8 +161,8 @@ class HeartbeatConsumer:
                 return AbortCode.PARAMETER_INCOMPATIBLE
             was_lost = guard.is_lost
             self._configure(guard, value)
-            if was_lost and not any(other.is_lost for other in self._guards):
-                self._on_change(node_id, False, now_ns)
+            if was_lost and not self.has_lost:
+                self._on_change(False, now_ns)
             self._on_subscription()
             return None
 

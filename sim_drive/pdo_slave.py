@@ -12,10 +12,12 @@ from typing import Any, Final, Protocol
 
 from drivers import objects
 from drivers.frame import Frame
+from drivers.nmt import SYNC_COB_ID
 from drivers.object_dictionary import FORMAT
 from drivers.pdo import PDO_COB_ID_INVALID, PDO_COB_ID_NO_RTR, PDO_MAX_ENTRIES, MappingEntry
 from drivers.sdo import AbortCode
 from sim_drive.axis import Axis, SetPointSource
+from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import Entry, LiveDictionary, WriteHook
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 
@@ -27,8 +29,6 @@ EVENT_ON_REQUEST: Final = 253
 EVENT_DRIVEN_TYPES: Final = frozenset({254, 255})
 PDO_MAX_BITS: Final = 64
 
-_COB_ID_MASK: Final = 0x7FF
-_EXTENDED_FRAME: Final = 1 << 29
 _INHIBIT_UNIT_NS: Final = 100_000
 _NS_PER_MS: Final = 1_000_000
 
@@ -167,7 +167,7 @@ class _Pdo:
 
     def _compile(self, cob_id: int, now_ns: int) -> None:
         mapped = self._mapped(self._mapping[0].value)
-        self.cob_id = cob_id & _COB_ID_MASK
+        self.cob_id = cob_id & COB_ID_MASK
         self.is_valid = not cob_id & PDO_COB_ID_INVALID and not isinstance(mapped, AbortCode)
         if self.is_valid and not isinstance(mapped, AbortCode):
             self.entries, self.length, codec = compile_mapping(mapped)
@@ -214,10 +214,10 @@ class _Pdo:
 
     def _on_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
         stays_valid = self.is_valid and not value & PDO_COB_ID_INVALID
-        if value & _EXTENDED_FRAME or (stays_valid and value & _COB_ID_MASK != self.cob_id):
+        if value & EXTENDED_FRAME or (stays_valid and value & COB_ID_MASK != self.cob_id):
             return AbortCode.VALUE_RANGE_EXCEEDED
         if not value & PDO_COB_ID_INVALID:
-            if is_restricted(value & _COB_ID_MASK):
+            if is_restricted(value & COB_ID_MASK) or value & COB_ID_MASK == SYNC_COB_ID:
                 return AbortCode.VALUE_RANGE_EXCEEDED
             mapped = self._mapped(self._mapping[0].value)
             if isinstance(mapped, AbortCode):
@@ -255,17 +255,6 @@ class _Pdo:
             return None
         found = self._find(value)
         return found if isinstance(found, AbortCode) else None
-
-
-def is_restricted(cob_id: int) -> bool:
-    """Whether CiA 301 (table 76) keeps this COB-ID from being configured for a PDO."""
-    return (
-        cob_id <= 0x080
-        or 0x101 <= cob_id <= 0x180
-        or 0x581 <= cob_id <= 0x5FF
-        or 0x601 <= cob_id <= 0x67F
-        or cob_id >= 0x6E0
-    )
 
 
 class ReceivePdo(_Pdo):

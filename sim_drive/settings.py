@@ -1,6 +1,7 @@
 """What distinguishes one emulated drive from another: identity, encoder, motor, and limits of its own making."""
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,3 +36,5 @@ class DriveSettings:
     """Segments in a sub-block of a block download, 1 to 127."""
     boot_up_delay_s: float = 0.0
     """From power-on or a reset to the boot-up message."""
+    parameter_file: Path | None = None
+    """Where parameters are stored (1010h) over the end of the process; None: nowhere."""

@@ -281,13 +281,15 @@ def test_history_holds_eight_and_is_cleared_by_zero_alone(bench: Bench):
 
 
 def test_emcy_may_be_moved_only_while_off(bench: Bench):
-    assert bench.write(0x1014, 0, 0x123, 4) == 0x06090030
+    assert bench.write(0x1014, 0, 0x190, 4) == 0x06090030
     bench.must(0x1014, 0, 0x80000085, 4)
     bench.drive.trip(0x2310, 0x02, bench.now_ns)
     assert bench.sent() == []
-    bench.must(0x1014, 0, 0x123, 4)
+    for restricted in (0x000, 0x07F, 0x123, 0x585, 0x605, 0x6E0, 0x705, 0x7E5, 0x20000190):
+        assert bench.write(0x1014, 0, restricted, 4) == 0x06090030
+    bench.must(0x1014, 0, 0x190, 4)
     bench.drive.trip(0x2311, 0x02, bench.now_ns)
-    assert bench.sent() == ["123#1123030000000000"]
+    assert bench.sent() == ["190#1123030000000000"]
 
 
 def test_persisting_trip_outlives_fault_resets_and_a_node_reset(bench: Bench):
