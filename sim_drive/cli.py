@@ -7,27 +7,33 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 
 from config.loading import ConfigError, load_config
-from config.schema import BusSection
+from config.schema import BusSection, GatewayConfig
 from drivers.errors import BusError, DriveError
+from drivers.nmt import MAX_NODE_ID
+from drivers.node import Event, Node
 from drivers.node_runner import RunStatistics
 from drivers.ports import interface_is_up, open_port
 from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
 from mechanism.errors import MechanismError
+from sim_drive.faults import Fault, describe_faults
+from sim_drive.scenario import Scenario, load_scenario, parse_fault
 from sim_drive.socketcand_server import SocketcandServer
 
 if TYPE_CHECKING:
+    from sim_drive.injector import Injector
     from sim_drive.machine import EmulatedMachine
 
 _EXIT_BUS: Final = 1
 _EXIT_USE: Final = 2
+_MAX_DIGITS: Final = 9
 
 _EPILOG: Final = """Examples:
 
@@ -36,14 +42,20 @@ _EPILOG: Final = """Examples:
   sim-drive paper --port 0 --json            any free port; a JSON line says which
   sim-drive paper --interface socketcan --channel vcan1
   sim-drive paper --duration 60 --ready-file /tmp/ready.json
+  sim-drive --nodes 1-20,30                  no machine: drives on free axes, at most 127
+  sim-drive paper --fault "servo over_current at_s=3" --fault "1 lost_frames cob_id=0x181 probability=0.01"
+  sim-drive paper --scenario trouble.yaml    the same in a file, faults: [{node: servo, kind: over_current, at_s: 3}]
+  sim-drive --list-faults                    every kind of fault, and what it takes
 
 Connect to it, over socketcand, with python-can:
 
 \b
   can.Bus(interface="socketcand", channel="vcan0", host="127.0.0.1", port=29536, tcp_tune=True)
 
-Exit status: 0 after --duration, SIGINT or SIGTERM; 1 if the bus cannot be opened or is lost; 2 for wrong use or a bad
-configuration.
+at_s counts from when the machine is switched on, in its own time; for_s says how long a fault lasts, else to the end.
+
+Exit status: 0 after --duration, SIGINT or SIGTERM; 1 if the bus cannot be opened or is lost; 2 for wrong use, a bad
+configuration or a bad scenario.
 """
 
 app: Final = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
@@ -86,9 +98,40 @@ class _Announcement:
                 pipe.write(line + "\n")
 
 
+@dataclass(frozen=True, slots=True)
+class _Fleet:
+    """Which drives there are."""
+
+    name: str
+    node_ids: tuple[int, ...]
+    config: GatewayConfig | None = None
+    """None: drives on free axes."""
+    names: dict[str, int] = field(default_factory=dict[str, int])
+    """Node ids by the names of their axes."""
+
+
+def _print_faults(wanted: bool) -> None:
+    if wanted:
+        print(describe_faults())
+        raise typer.Exit
+
+
 @app.command(epilog=_EPILOG)
 def sim_drive(
-    config: Annotated[str, typer.Argument(help="Configuration file, or the name of a shipped one: paper.")],
+    config: Annotated[
+        str | None, typer.Argument(help="Configuration file, or the name of a shipped one: paper.")
+    ] = None,
+    nodes: Annotated[
+        str | None, typer.Option(help="In place of CONFIG: node ids of drives on free axes, such as 1-20,30.")
+    ] = None,
+    scenario: Annotated[Path | None, typer.Option(help="File that says which faults there are, and when.")] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help='One fault: "NODE KIND [KEY=VALUE]..."; may be given several times.')
+    ] = None,
+    list_faults: Annotated[
+        bool,
+        typer.Option("--list-faults", help="List all faults and exit.", callback=_print_faults, is_eager=True),
+    ] = False,
     interface: Annotated[
         str | None, typer.Option(help="auto, socketcan, socketcand or a python-can interface  [default: from CONFIG]")
     ] = None,
@@ -120,15 +163,14 @@ def sim_drive(
     """Emulate the drives of a machine, and the machine that they move, on a CAN bus."""
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="sim-drive: %(message)s")
     stop = _stop_on_signals()
-    settings = load_config(config)
-    place = _place(settings.bus, interface, channel, host, port)
+    fleet = _fleet(config, nodes)
+    trouble = _scenario(scenario, fault or [], fleet)
+    bus_section = BusSection() if fleet.config is None else fleet.config.bus
+    place = _place(bus_section, interface, channel, host, port)
     announcement = _Announcement(as_json, ready_file, ready_fd)
 
-    def build() -> "EmulatedMachine":
-        # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
-        from sim_drive.assembly import build_machine
-
-        machine = build_machine(settings, seed)
+    def build() -> Node:
+        machine = _build(fleet, trouble, seed)
         _prepare_process(realtime)
         return machine
 
@@ -138,19 +180,22 @@ def sim_drive(
         end_s = time.monotonic() + duration
         return lambda: stop() or time.monotonic() >= end_s
 
+    on_event = _fault_reporter(as_json) if trouble.faults else None
     if place.host is None or place.port is None:
         bus = open_port(place.interface, place.channel)
         try:
             machine = build()
-            announcement.make(settings.name, place)
-            statistics = run_node(machine, bus, until())
+            announcement.make(fleet.name, place)
+            statistics = run_node(machine, bus, until(), on_event)
         finally:
             bus.close()
     else:
-        server = SocketcandServer(build(), place.host, place.port, place.channel, allow_remote=allow_remote)
+        server = SocketcandServer(
+            build(), place.host, place.port, place.channel, on_event=on_event, allow_remote=allow_remote
+        )
         with server:
             real_host, real_port = server.address
-            announcement.make(settings.name, _Place(place.interface, place.channel, real_host, real_port))
+            announcement.make(fleet.name, _Place(place.interface, place.channel, real_host, real_port))
             statistics = server.run(until())
     _report(statistics, as_json)
 
@@ -170,6 +215,80 @@ def main() -> NoReturn:
     for sentence in sentences:
         print(f"sim-drive: {sentence}", file=sys.stderr)
     sys.exit(status)
+
+
+def _fleet(config: str | None, nodes: str | None) -> _Fleet:
+    """The drives that the command line asks for. Raises ConfigError."""
+    if (config is None) == (nodes is None):
+        raise ConfigError(["give either CONFIG or --nodes" + (", not both" if config is not None else "")])
+    if nodes is not None:
+        node_ids = parse_node_ids(nodes)
+        return _Fleet(f"a row of {len(node_ids)} free axes", node_ids)
+    settings = load_config(config or "")
+    names = {name: settings.axes[name].node_id for name in settings.axis_names}
+    return _Fleet(settings.name, tuple(names.values()), settings, names)
+
+
+def parse_node_ids(text: str) -> tuple[int, ...]:
+    """Node ids such as ``1-20,30``, in the order in which they are given. Raises ConfigError."""
+    node_ids: list[int] = []
+    for part in text.split(","):
+        first, dash, last = part.strip().partition("-")
+        ends = (first, last if dash else first)
+        if not all(end.isascii() and end.isdigit() and len(end) <= _MAX_DIGITS for end in ends):
+            raise ConfigError([f"--nodes {text}: '{part}' is neither a node id nor a range such as 1-20"])
+        low, high = map(int, ends)
+        for node_id in (low, high):
+            if not 1 <= node_id <= MAX_NODE_ID:
+                raise ConfigError([f"--nodes {text}: node id {node_id} is not 1 to {MAX_NODE_ID}"])
+        if low > high:
+            raise ConfigError([f"--nodes {text}: {part} runs backwards"])
+        for node_id in range(low, high + 1):
+            if node_id in node_ids:
+                raise ConfigError([f"--nodes {text}: node id {node_id} is given twice, every node id must be unique"])
+            node_ids.append(node_id)
+    return tuple(node_ids)
+
+
+def _scenario(file: Path | None, words: Sequence[str], fleet: _Fleet) -> Scenario:
+    """All faults that the command line asks for. Raises ConfigError."""
+    scenario = Scenario() if file is None else load_scenario(file, fleet.names, fleet.node_ids)
+    further: list[Fault] = []
+    for text in words:
+        further += parse_fault(text, fleet.names, fleet.node_ids)
+    return Scenario((*scenario.faults, *further), scenario.seed, scenario.name)
+
+
+def _build(fleet: _Fleet, scenario: Scenario, seed: int) -> "EmulatedMachine | Injector":
+    # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
+    from sim_drive.assembly import build_machine, free_machine
+    from sim_drive.injector import Injector
+
+    machine = free_machine(fleet.node_ids, seed=seed) if fleet.config is None else build_machine(fleet.config, seed)
+    return Injector(machine, scenario.faults, scenario.seed ^ seed) if scenario.faults else machine
+
+
+def _fault_reporter(as_json: bool) -> Callable[[Event], None]:
+    """Tells of faults that begin and end, at_ns on the host's clock."""
+    from sim_drive.injector import FaultEnded, FaultStarted
+
+    def report(event: Event) -> None:
+        if not isinstance(event, FaultStarted | FaultEnded):
+            return
+        fault = event.fault
+        is_start = isinstance(event, FaultStarted)
+        if as_json:
+            line = {
+                "event": "fault_started" if is_start else "fault_ended",
+                "at_ns": event.at_ns,
+                "node_id": fault.node_id,
+                "kind": fault.kind.value,
+            }
+            print(json.dumps(line), flush=True)
+        verb = "begins" if is_start else "is over"
+        print(f"sim-drive: node {fault.node_id}: {fault.kind.value} {verb}", file=sys.stderr, flush=True)
+
+    return report
 
 
 def _place(bus: BusSection, interface: str | None, channel: str | None, host: str | None, port: int | None) -> _Place:

@@ -66,7 +66,7 @@ class FaultSection(Model):
         if self.node == ALL_NODES:
             return node_ids
         node_id = nodes.get(self.node) if isinstance(self.node, str) else self.node
-        if node_id not in node_ids:
+        if node_id is None or node_id not in node_ids:
             known = ", ".join([*nodes, *map(str, sorted(node_ids)), ALL_NODES])
             raise ValueError(f"node: there is no {self.node} (there are: {known})")
         return [node_id]
