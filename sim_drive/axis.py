@@ -15,23 +15,28 @@ from sim_drive.cam_slots import CamSlots
 from sim_drive.cia402 import (
     COMMANDS,
     MODES,
+    QUICK_STOP_STAYS,
     STATE_BITS,
-    STOP_OPTIONS,
+    STOP_RAMPS,
+    AbortConnection,
     Controlword,
     Mode,
     PowerCommand,
     PowerState,
     PowerStateChanged,
     Statusword,
-    StopOption,
+    StopRamp,
     next_state,
 )
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.camming import Camming
-from sim_drive.modes.cyclic import CyclicPosition
+from sim_drive.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
 from sim_drive.modes.homing import Homing, HomingStatus
+from sim_drive.modes.profile_position import ProfilePosition
+from sim_drive.modes.profile_torque import ProfileTorque
+from sim_drive.modes.profile_velocity import ProfileVelocity
 from sim_drive.motion import Latch, Motion, SetPointSource, wrap_int32
 from sim_drive.settings import DriveSettings
 
@@ -48,23 +53,36 @@ _BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
 _FOLLOWING_ERROR: Final = int(Statusword.FOLLOWING_ERROR)
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
 _FAULT_RESET: Final = int(Controlword.FAULT_RESET)
-_RESUMING: Final = (PowerState.QUICK_STOP_ACTIVE, PowerState.OPERATION_ENABLED)
+_HALT: Final = int(Controlword.HALT)
+_OPTION_CODES: Final = {
+    PowerState.SWITCHED_ON: objects.DISABLE_OPERATION_OPTION_CODE,
+    PowerState.READY_TO_SWITCH_ON: objects.SHUTDOWN_OPTION_CODE,
+}
+"""How the axis stops on its way from Operation enabled to these states."""
 _DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
 # Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
 _OPERATION_ENABLED: Final = PowerState.OPERATION_ENABLED
 _NO_CONTROLWORD: Final = -1
-_TIMED_MODES: Final = frozenset({Mode.CYCLIC_SYNCHRONOUS_POSITION, Mode.CAMMING})
+_TIMED_MODES: Final = frozenset(
+    {
+        Mode.CYCLIC_SYNCHRONOUS_POSITION,
+        Mode.CYCLIC_SYNCHRONOUS_VELOCITY,
+        Mode.CYCLIC_SYNCHRONOUS_TORQUE,
+        Mode.CAMMING,
+    }
+)
 """Modes in which the interpolation time must not change."""
 
 
 class Axis(Motion):
     """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it.
 
-    Controlword bit 8 (halt) has no effect in the modes that the drive has.
+    A ramp before a state is left (605Bh, 605Ch) is run in the state; enabling the operation again calls it off.
     """
 
     __slots__ = (
         "_active",
+        "_after_ramp",
         "_emergency",
         "_events",
         "_following_error",
@@ -84,12 +102,10 @@ class Axis(Motion):
         "_node_id",
         "_position_actual",
         "_position_demand",
-        "_quick_stop_deceleration",
         "_rated_torque_Nm",
         "_sampled_at_ns",
         "_state",
         "_statusword",
-        "_stops_then_stays",
         "_ticking",
         "_torque_actual",
         "_torque_offset",
@@ -126,7 +142,6 @@ class Axis(Motion):
         self._following_error = entry(objects.FOLLOWING_ERROR_ACTUAL_VALUE)
         self._following_error_window = entry(objects.FOLLOWING_ERROR_WINDOW)
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
-        self._quick_stop_deceleration = entry(objects.QUICK_STOP_DECELERATION)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
         self._interpolation_exponent = entry(objects.INTERPOLATION_TIME_PERIOD, 2)
         self._max_torque = entry(objects.MAX_TORQUE)
@@ -139,7 +154,12 @@ class Axis(Motion):
         self._modes: dict[Mode, OperationMode] = {
             Mode.NONE: OperationMode(self),
             Mode.HOMING: self._homing,
+            Mode.PROFILE_POSITION: ProfilePosition(self),
+            Mode.PROFILE_VELOCITY: ProfileVelocity(self),
+            Mode.PROFILE_TORQUE: ProfileTorque(self),
             Mode.CYCLIC_SYNCHRONOUS_POSITION: CyclicPosition(self),
+            Mode.CYCLIC_SYNCHRONOUS_VELOCITY: CyclicVelocity(self),
+            Mode.CYCLIC_SYNCHRONOUS_TORQUE: CyclicTorque(self),
             Mode.CAMMING: Camming(self, slots),
         }
         self._active: OperationMode | None = None
@@ -156,7 +176,8 @@ class Axis(Motion):
         self._mode = Mode.NONE
         self.is_powered = False
         """Whether the amplifier may put torque on the motor."""
-        self._stops_then_stays = False
+        self._after_ramp: PowerState | None = None
+        """The state that is next when the axis has come to rest."""
         self._following_error_since_ns: int | None = None
         self._sampled_at_ns = -1
         self.gains: tuple[int, ...] = ()
@@ -219,7 +240,9 @@ class Axis(Motion):
         """Power-on state, from the values that the dictionary holds; the offset of the last homing is lost."""
         self._state = PowerState.NOT_READY_TO_SWITCH_ON
         self._mode = Mode.NONE
+        self._after_ramp = None
         self._activate(0)
+        self.torque_demand = None
         for mode in self._modes.values():
             mode.reset()
         self._idle_controlword = _NO_CONTROLWORD
@@ -263,6 +286,15 @@ class Axis(Motion):
         return self._torque_offset.value * 0.001 * self._rated_torque_Nm
 
     @property
+    def torque_demand_Nm(self) -> float | None:  # noqa: N802 - the unit is part of the name
+        """Torque that a torque mode asks for, within max torque 6072h; None where the position controller decides."""
+        demand = self.torque_demand
+        if demand is None or not self.is_powered:
+            return None
+        bound = float(self._max_torque.value)
+        return max(-bound, min(bound, demand)) * 0.001 * self._rated_torque_Nm
+
+    @property
     def torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
         """Max torque 6072h."""
         return self._max_torque.value * 0.001 * self._rated_torque_Nm
@@ -288,7 +320,7 @@ class Axis(Motion):
             return
         demand = self.demand.at(now_ns)
         self.position_demand_counts = demand
-        if state is _OPERATION_ENABLED:
+        if state is _OPERATION_ENABLED and self._after_ramp is None:
             if self.is_guarded and now_ns - self.set_point_at_ns > self.set_point_timeout_ns:
                 self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
                 return
@@ -299,8 +331,8 @@ class Axis(Motion):
             if state is PowerState.FAULT_REACTION_ACTIVE:
                 self._go_to_state(PowerState.FAULT, now_ns)
                 return
-            if not self._stops_then_stays:
-                self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
+            if self._after_ramp is not None:
+                self._go_to_state(self._after_ramp, now_ns)
                 return
         window = self._following_error_window.value
         if self._following_error_since_ns is not None or not -window <= demand - shaft_counts <= window:
@@ -362,8 +394,17 @@ class Axis(Motion):
         self._execute(command, now_ns)
         if command is PowerCommand.ENABLE_OPERATION and state is PowerState.READY_TO_SWITCH_ON:
             self._execute(command, now_ns)
-        if self._active is not None:
-            self._active.on_controlword(value, now_ns)
+        active = self._active
+        if active is not None:
+            active.on_controlword(value, now_ns)
+            is_halted = bool(value & _HALT)
+            if is_halted is not self.is_halted and self._active is active:
+                self.is_halted = is_halted
+                if is_halted:
+                    active.halt(now_ns)
+                else:
+                    active.resume(now_ns)
+                self.show_status()
         if value == before and next_state(self._state, command) is self._state:
             self._idle_controlword = value
         return None
@@ -371,28 +412,68 @@ class Axis(Motion):
     def _execute(self, command: PowerCommand, now_ns: int) -> None:
         state = self._state
         after = next_state(state, command)
+        if state is not _OPERATION_ENABLED:
+            # There is no way back from a quick stop that is to end in another state (transition 16).
+            if after is not state and (after is not _OPERATION_ENABLED or self._after_ramp is None):
+                self._go_to_state(after, now_ns)
+            return
         if after is state:
+            if command is PowerCommand.ENABLE_OPERATION and self._after_ramp is not None:
+                self._after_ramp = None
+                self._activate(now_ns)
+                self.show_status()
             return
         if after is PowerState.QUICK_STOP_ACTIVE:
-            option = self._option(objects.QUICK_STOP_OPTION_CODE)
-            if option is StopOption.DISABLE:
-                after = PowerState.SWITCH_ON_DISABLED
-            else:
-                self._stops_then_stays = option is StopOption.RAMP_THEN_STAY
-                self.demand.brake(now_ns, float(self._quick_stop_deceleration.value))
-        elif (state, after) == _RESUMING and not self._stops_then_stays:
+            self._quick_stop(now_ns)
             return
+        index = _OPTION_CODES.get(after)
+        if index is not None and self._option(index) is not StopRamp.NONE:
+            if self._after_ramp is None:
+                self._stop(StopRamp.SLOW_DOWN, now_ns)
+                self.show_status()
+            if not self.demand.is_over(now_ns):
+                self._after_ramp = after
+                return
         self._go_to_state(after, now_ns)
 
-    def _option(self, index: int) -> StopOption:
-        value: int = self.dictionary.entry(index).value
-        return STOP_OPTIONS[value]
+    def _quick_stop(self, now_ns: int) -> None:
+        code: int = self.entry(objects.QUICK_STOP_OPTION_CODE).value
+        if code == StopRamp.NONE:
+            self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
+            return
+        stays = code >= QUICK_STOP_STAYS
+        self._stop(STOP_RAMPS[code - QUICK_STOP_STAYS + 1 if stays else code], now_ns)
+        self._go_to_state(PowerState.QUICK_STOP_ACTIVE, now_ns)
+        self._after_ramp = None if stays else PowerState.SWITCH_ON_DISABLED
+
+    def _option(self, index: int) -> StopRamp:
+        value: int = self.entry(index).value
+        return STOP_RAMPS[value]
+
+    def _stop(self, ramp: StopRamp, now_ns: int) -> None:
+        """Leave the active mode, and let the demand come to rest."""
+        self._deactivate(now_ns)
+        self.demand.brake(now_ns, self.deceleration_of(ramp))
+
+    def lose_connection(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
+        """The master is gone: EMCY, and, if the axis is enabled, what the option code 6007h says."""
+        action: int = self.entry(objects.ABORT_CONNECTION_OPTION_CODE).value if self.is_powered else 0
+        if action == AbortConnection.FAULT:
+            self.trip(error_code, register_bits, now_ns, persists=persists)
+            return
+        self._emergency.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=persists)
+        if action == AbortConnection.DISABLE_VOLTAGE:
+            self._execute(PowerCommand.DISABLE_VOLTAGE, now_ns)
+        elif action == AbortConnection.QUICK_STOP:
+            self._execute(PowerCommand.QUICK_STOP, now_ns)
+        self._idle_controlword = _NO_CONTROLWORD
 
     def _go_to_state(self, state: PowerState, now_ns: int) -> None:
         before = self._state
         if state is before:
             return
         self._state = state
+        self._after_ramp = None
         self._idle_controlword = _NO_CONTROLWORD
         self._events.append(PowerStateChanged(now_ns, self._node_id, before, state))
         was_powered = self.is_powered
@@ -418,10 +499,11 @@ class Axis(Motion):
         if self._state in {PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT}:
             return
         if self.is_powered:
-            if self._option(objects.FAULT_REACTION_OPTION_CODE) is StopOption.DISABLE:
+            ramp = self._option(objects.FAULT_REACTION_OPTION_CODE)
+            if ramp is StopRamp.NONE:
                 self.is_powered = False
             elif self._state is PowerState.OPERATION_ENABLED:
-                self.demand.brake(now_ns, float(self._quick_stop_deceleration.value))
+                self._stop(ramp, now_ns)
         self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)
 
     # -- modes ---------------------------------------------------------------------------------------------------
@@ -436,21 +518,29 @@ class Axis(Motion):
         self._activate(now_ns)
         self.show_status()
 
-    def _activate(self, now_ns: int) -> None:
-        """Leave the mode that was active, and enter the selected one if operation is enabled."""
+    def _deactivate(self, now_ns: int) -> None:
         active = self._active
         self._active = None
         self._ticking = None
         self.on_sync = _nothing
         self.is_guarded = False
+        self.is_halted = False
         if active is not None:
             active.leave(now_ns)
-        if self._state is _OPERATION_ENABLED:
-            mode = self._modes[self._mode]
-            self._active = mode
-            self._ticking = mode if mode.is_ticking else None
-            self.on_sync = mode.on_sync
-            mode.enter(now_ns)
+
+    def _activate(self, now_ns: int) -> None:
+        """Leave the mode that was active, and enter the selected one if operation is enabled."""
+        self._deactivate(now_ns)
+        if self._state is not _OPERATION_ENABLED or self._after_ramp is not None:
+            return
+        mode = self._modes[self._mode]
+        self._active = mode
+        self._ticking = mode if mode.is_ticking else None
+        self.on_sync = mode.on_sync
+        self.is_halted = bool(self.controlword.value & _HALT)
+        mode.enter(now_ns)
+        if self.is_halted and self._active is mode:
+            mode.halt(now_ns)
 
     # -- interpolation time 60C2h --------------------------------------------------------------------------------
 

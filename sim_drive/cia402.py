@@ -46,8 +46,13 @@ class Controlword(IntFlag):
     QUICK_STOP = 1 << 2
     ENABLE_OPERATION = 1 << 3
     HOMING_START = 1 << 4
+    NEW_SET_POINT = 1 << 4
+    ENABLE_INTERPOLATION = 1 << 4
+    CHANGE_IMMEDIATELY = 1 << 5
+    RELATIVE = 1 << 6
     FAULT_RESET = 1 << 7
     HALT = 1 << 8
+    CHANGE_ON_SET_POINT = 1 << 9
 
 
 class Statusword(IntFlag):
@@ -61,6 +66,9 @@ class Statusword(IntFlag):
     FOLLOWS_COMMAND = 1 << 12
     """csp and camming: the drive follows the command value."""
     HOMING_ATTAINED = 1 << 12
+    SET_POINT_ACKNOWLEDGE = 1 << 12
+    SPEED_ZERO = 1 << 12
+    INTERPOLATION_ACTIVE = 1 << 12
     FOLLOWING_ERROR = 1 << 13
     HOMING_ERROR = 1 << 13
 
@@ -131,8 +139,13 @@ class Mode(IntEnum):
     CAMMING = -2
     """The manufacturer's: the axis follows a cam table in a profile slot (other vendors use -2 for it too)."""
     NONE = 0
+    PROFILE_POSITION = 1
+    PROFILE_VELOCITY = 3
+    PROFILE_TORQUE = 4
     HOMING = 6
     CYCLIC_SYNCHRONOUS_POSITION = 8
+    CYCLIC_SYNCHRONOUS_VELOCITY = 9
+    CYCLIC_SYNCHRONOUS_TORQUE = 10
 
 
 MODES: Final = {int(mode): mode for mode in Mode}
@@ -140,27 +153,32 @@ MODES: Final = {int(mode): mode for mode in Mode}
 
 
 @unique
-class StopOption(IntEnum):
-    """What a quick stop (605Ah) or a fault reaction (605Eh) does, as far as the drive tells the options apart.
+class StopRamp(IntEnum):
+    """How an option code (605Ah to 605Eh) stops the axis."""
 
-    The standard's options for other ramps (1 slow down, 3 current limit, 4 voltage limit; 5, 7 and 8 with stay) are all
-    carried out with the quick stop ramp 6085h.
-    """
+    NONE = 0
+    """No torque from now on."""
+    SLOW_DOWN = 1
+    """Profile deceleration 6084h."""
+    QUICK_STOP = 2
+    """Quick stop deceleration 6085h."""
+    CURRENT_LIMIT = 3
+    """Max deceleration 60C6h: the drive has no regulator of the current alone."""
+    VOLTAGE_LIMIT = 4
+    """As the current limit."""
 
-    DISABLE = 0
-    RAMP_THEN_DISABLE = 2
-    RAMP_THEN_STAY = 6
+
+STOP_RAMPS: Final = tuple(StopRamp)
+"""The StopRamp of each value 0 to 4 of an option code."""
+QUICK_STOP_STAYS: Final = 5
+"""From this value of 605Ah on, the ramp is that of the value less 4, and the drive stays in Quick stop active."""
 
 
-STOP_OPTIONS: Final = (
-    StopOption.DISABLE,
-    StopOption.RAMP_THEN_DISABLE,
-    StopOption.RAMP_THEN_DISABLE,
-    StopOption.RAMP_THEN_DISABLE,
-    StopOption.RAMP_THEN_DISABLE,
-    StopOption.RAMP_THEN_STAY,
-    StopOption.RAMP_THEN_STAY,
-    StopOption.RAMP_THEN_STAY,
-    StopOption.RAMP_THEN_STAY,
-)
-"""The StopOption of each value 0 to 8 of the option code."""
+@unique
+class AbortConnection(IntEnum):
+    """Abort connection option code 6007h: what an enabled axis does when it loses its master."""
+
+    NO_ACTION = 0
+    FAULT = 1
+    DISABLE_VOLTAGE = 2
+    QUICK_STOP = 3

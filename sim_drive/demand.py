@@ -1,14 +1,33 @@
-"""The position demand between set-points: hold, straight line, or braking ramp, as a function of time."""
+"""The position demand between set-points: hold, line, braking ramp, or a planned sequence, as a function of time."""
 
-from typing import Final
+from collections.abc import Sequence
+from math import inf
+from typing import Final, NamedTuple
 
 _S_PER_NS: Final = 1e-9
 
 
-class Demand:
-    """A parabola in time that ends in standstill: position (counts, shaft frame), velocity, acceleration, duration."""
+class Piece(NamedTuple):
+    """A span of constant acceleration (counts/s^2); an infinite one never ends."""
 
-    __slots__ = ("acceleration", "duration_s", "position", "start_ns", "velocity")
+    acceleration: float
+    duration_s: float
+
+
+class _Planned(NamedTuple):
+    start_s: float
+    position: float
+    velocity: float
+    acceleration: float
+
+
+class Demand:
+    """A parabola in time that ends in standstill: position (counts, shaft frame), velocity, acceleration, duration.
+
+    A plan has more of them, one after the other; the first is then as if it were alone.
+    """
+
+    __slots__ = ("_end", "_end_s", "_planned", "acceleration", "duration_s", "position", "start_ns", "velocity")
 
     def __init__(self) -> None:
         self.start_ns = 0
@@ -16,11 +35,16 @@ class Demand:
         self.velocity = 0.0
         self.acceleration = 0.0
         self.duration_s = 0.0
+        self._planned: tuple[_Planned, ...] = ()
+        self._end = 0.0
+        self._end_s = 0.0
 
     def at(self, now_ns: int) -> float:
         """Demand in counts at ``now_ns``; before the start it is the start's, after the end the end's."""
         t = (now_ns - self.start_ns) * _S_PER_NS
         if t >= self.duration_s:
+            if self._planned:
+                return self._beyond(t)[0]
             t = self.duration_s
         elif t < 0.0:
             t = 0.0
@@ -30,12 +54,41 @@ class Demand:
         """Demand velocity in counts/s at ``now_ns``."""
         t = (now_ns - self.start_ns) * _S_PER_NS
         if t >= self.duration_s:
-            return 0.0
+            return self._beyond(t)[1] if self._planned else 0.0
         return self.velocity + self.acceleration * max(t, 0.0)
 
     def is_over(self, now_ns: int) -> bool:
         """Whether the demand has come to rest."""
-        return (now_ns - self.start_ns) * _S_PER_NS >= self.duration_s
+        return (now_ns - self.start_ns) * _S_PER_NS >= (self._end_s if self._planned else self.duration_s)
+
+    @property
+    def is_planned(self) -> bool:
+        """Whether it is a plan, rather than a line or a ramp that will soon be over."""
+        return bool(self._planned)
+
+    def _beyond(self, t: float) -> tuple[float, float]:
+        """Position and velocity of a plan after its first piece."""
+        if t >= self._end_s:
+            return self._end, 0.0
+        for start_s, position, velocity, acceleration in reversed(self._planned):
+            if t >= start_s:
+                t -= start_s
+                return position + (velocity + 0.5 * acceleration * t) * t, velocity + acceleration * t
+        return self.position, self.velocity
+
+    def span_ahead(self, now_ns: int) -> tuple[float, float]:
+        """Least and greatest position from ``now_ns`` on, in counts; infinite if it never comes to rest."""
+        t = (now_ns - self.start_ns) * _S_PER_NS
+        positions = [self.at(now_ns)]
+        if self._planned:
+            positions += [piece.position for piece in self._planned if piece.start_s > t]
+            last = self._planned[-1]
+            positions.append(inf * last.velocity if self._end_s == inf and last.velocity != 0.0 else self._end)
+        else:
+            positions.append(
+                self.position + (self.velocity + 0.5 * self.acceleration * self.duration_s) * self.duration_s
+            )
+        return min(positions), max(positions)
 
     def hold(self, position: float) -> None:
         """Stay at ``position``."""
@@ -43,6 +96,7 @@ class Demand:
         self.velocity = 0.0
         self.acceleration = 0.0
         self.duration_s = 0.0
+        self._planned = ()
 
     def go_to(self, target: float, now_ns: int, period_s: float, overrun_s: float) -> None:
         """Go from where the demand is now to ``target`` in a straight line that takes ``period_s``.
@@ -58,6 +112,7 @@ class Demand:
         self.velocity = (target - start) / period_s
         self.acceleration = 0.0
         self.duration_s = period_s + overrun_s
+        self._planned = ()
 
     def brake(self, now_ns: int, deceleration: float) -> None:
         """Ramp the present velocity down to standstill with ``deceleration`` (counts/s^2, positive)."""
@@ -68,3 +123,39 @@ class Demand:
         self.velocity = velocity
         self.acceleration = -deceleration if velocity > 0.0 else deceleration
         self.duration_s = abs(velocity) / deceleration
+        self._planned = ()
+
+    def launch(self, position: float, velocity: float, now_ns: int) -> None:
+        """Be at ``position`` with ``velocity`` (counts/s) now, and go on so."""
+        self.position = position
+        self.start_ns = now_ns
+        self.velocity = velocity
+        self.acceleration = 0.0
+        self.duration_s = inf
+        self._planned = ()
+        self.plan([Piece(0.0, inf)], now_ns)
+
+    def plan(self, pieces: Sequence[Piece], now_ns: int, end: float | None = None) -> None:
+        """Go on from where the demand is now, with the velocity it has, in ``pieces`` of constant acceleration.
+
+        After the last one, unless that is infinite, it rests: at ``end`` if given, which is then where the pieces lead.
+        """
+        position = self.at(now_ns)
+        velocity = self.velocity_at(now_ns)
+        planned: list[_Planned] = []
+        start_s = 0.0
+        for acceleration, duration_s in pieces:
+            planned.append(_Planned(start_s, position, velocity, acceleration))
+            start_s += duration_s
+            if duration_s < inf:
+                position += (velocity + 0.5 * acceleration * duration_s) * duration_s
+                velocity += acceleration * duration_s
+        if not planned:
+            self.hold(position if end is None else end)
+            return
+        self.start_ns = now_ns
+        _, self.position, self.velocity, self.acceleration = planned[0]
+        self.duration_s = pieces[0].duration_s
+        self._planned = tuple(planned)
+        self._end = position if end is None else end
+        self._end_s = start_s

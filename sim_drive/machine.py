@@ -62,6 +62,8 @@ class MachineDrive(Protocol):
     @property
     def torque_offset_Nm(self) -> float: ...  # noqa: N802
     @property
+    def torque_demand_Nm(self) -> float | None: ...  # noqa: N802
+    @property
     def torque_limit_Nm(self) -> float: ...  # noqa: N802
     @property
     def is_powered(self) -> bool: ...
@@ -416,14 +418,20 @@ class EmulatedMachine:
                 demand = drive.position_demand_counts
                 if not motor.is_powered:
                     self._power_on(motor, demand, now_ns)
-                torques[index] = motor.servo.update(
-                    demand,
-                    counts,
-                    drive.gains,
-                    drive.torque_offset_Nm,
-                    axis.torque_per_volt,
-                    drive.torque_limit_Nm,
-                )
+                torque = drive.torque_demand_Nm
+                if torque is None:
+                    torque = motor.servo.update(
+                        demand,
+                        counts,
+                        drive.gains,
+                        drive.torque_offset_Nm,
+                        axis.torque_per_volt,
+                        drive.torque_limit_Nm,
+                    )
+                else:
+                    # The controller is to start without a bump when it gets the axis back.
+                    motor.servo.reset(demand, counts)
+                torques[index] = torque
             else:
                 motor.is_powered = False
                 torques[index] = 0.0

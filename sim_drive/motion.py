@@ -12,7 +12,7 @@ from math import floor
 from typing import Final
 
 from drivers import objects
-from sim_drive.cia402 import Statusword
+from sim_drive.cia402 import STOP_RAMPS, Statusword, StopRamp
 from sim_drive.demand import Demand
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.settings import DriveSettings
@@ -23,6 +23,8 @@ Latch = Callable[[int], tuple[int, float, int]]
 _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
 _S_PER_NS: Final = 1e-9
+_TWO_TICKS_S: Final = 0.002
+"""Room for the servo tick at which braking is found to be due, and the one before it."""
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
 
 
@@ -46,14 +48,23 @@ class Motion(ABC):
     """The part of an axis that its modes see and move."""
 
     __slots__ = (
+        "_acceleration",
+        "_deceleration",
+        "_halt_option",
         "_limit_high",
         "_limit_low",
+        "_max_acceleration",
+        "_max_deceleration",
+        "_max_profile_velocity",
+        "_max_speed",
+        "_quick_stop_deceleration",
         "_set_point_limit",
         "controlword",
         "demand",
         "dictionary",
         "internal_bits",
         "is_guarded",
+        "is_halted",
         "latch",
         "offset",
         "period_ns",
@@ -63,6 +74,7 @@ class Motion(ABC):
         "settings",
         "shaft_counts",
         "source",
+        "torque_demand",
     )
 
     def __init__(self, dictionary: LiveDictionary, settings: DriveSettings) -> None:
@@ -88,6 +100,18 @@ class Motion(ABC):
         self.period_s = 0.0
         self._set_point_limit = settings.missing_set_point_limit
         self.controlword = self.entry(objects.CONTROLWORD)
+        self.is_halted = False
+        """Controlword bit 8 while operation is enabled: set-points wait."""
+        self.torque_demand: float | None = None
+        """Per mille of rated torque, from a mode that goes around the position controller; None leaves it to that."""
+        self._acceleration = self.entry(objects.PROFILE_ACCELERATION)
+        self._deceleration = self.entry(objects.PROFILE_DECELERATION)
+        self._quick_stop_deceleration = self.entry(objects.QUICK_STOP_DECELERATION)
+        self._max_acceleration = self.entry(objects.MAX_ACCELERATION)
+        self._max_deceleration = self.entry(objects.MAX_DECELERATION)
+        self._max_profile_velocity = self.entry(objects.MAX_PROFILE_VELOCITY)
+        self._max_speed = self.entry(objects.MAX_MOTOR_SPEED)
+        self._halt_option = self.entry(objects.HALT_OPTION_CODE)
         self._limit_low = self.entry(objects.SOFTWARE_POSITION_LIMIT, 1)
         self._limit_high = self.entry(objects.SOFTWARE_POSITION_LIMIT, 2)
 
@@ -134,6 +158,98 @@ class Motion(ABC):
         if is_limited != bool(self.internal_bits & _LIMITED):
             self.set_internal_bit(_LIMITED, is_limited)
         return target
+
+    @property
+    def acceleration(self) -> float:
+        """Profile acceleration 6083h within 60C5h, in counts/s^2."""
+        return float(min(self._acceleration.value, self._max_acceleration.value))
+
+    @property
+    def deceleration(self) -> float:
+        """Profile deceleration 6084h within 60C6h, in counts/s^2."""
+        return float(min(self._deceleration.value, self._max_deceleration.value))
+
+    @property
+    def max_acceleration(self) -> float:
+        """Max acceleration 60C5h in counts/s^2."""
+        return float(self._max_acceleration.value)
+
+    @property
+    def max_deceleration(self) -> float:
+        """Max deceleration 60C6h in counts/s^2."""
+        return float(self._max_deceleration.value)
+
+    @property
+    def max_velocity(self) -> float:
+        """What 607Fh (counts/s) and 6080h (revolutions a minute) both allow, in counts/s."""
+        return min(
+            float(self._max_profile_velocity.value), self._max_speed.value * self.settings.counts_per_revolution / 60.0
+        )
+
+    def deceleration_of(self, ramp: StopRamp) -> float:
+        """The deceleration of a stop ramp in counts/s^2; max deceleration 60C6h limits the profile's alone."""
+        if ramp is StopRamp.SLOW_DOWN:
+            return self.deceleration
+        if ramp is StopRamp.QUICK_STOP:
+            return float(self._quick_stop_deceleration.value)
+        return float(self._max_deceleration.value)
+
+    def slow_down(self, now_ns: int) -> None:
+        """Bring the demand to rest with the profile deceleration, if it moves."""
+        if not self.demand.is_over(now_ns):
+            self.demand.brake(now_ns, self.deceleration)
+
+    def halt(self, now_ns: int) -> None:
+        """Bring the demand to rest as the halt option code 605Dh says."""
+        self.is_guarded = False
+        self.demand.brake(now_ns, self.deceleration_of(STOP_RAMPS[int(self._halt_option.value)]))
+
+    def take_over(self, now_ns: int) -> None:
+        """Let the position controller have an axis again that a torque moved: from where it is, to rest."""
+        self.torque_demand = None
+        self.demand.launch(float(self.shaft_counts), self.latch(now_ns)[1], now_ns)
+        self.demand.brake(now_ns, self.deceleration)
+
+    def stop_at_limits(self, now_ns: int) -> bool:
+        """Brake where the demand would else leave the software position limits 607Dh; whether it had to.
+
+        It is to be asked at every servo tick: it brakes as late as the quick stop deceleration allows, and then with
+        what it takes to stand at the limit.
+        """
+        low = self._limit_low.value
+        high = self._limit_high.value
+        if low >= high or (low == -_HALF and high == _HALF - 1):
+            return False
+        demand = self.demand
+        least, greatest = demand.span_ahead(now_ns)
+        here = demand.at(now_ns)
+        place = wrap_int32(floor(here) + self.offset) + here - floor(here)
+        if place + greatest - here <= high and place + least - here >= low:
+            return False
+        velocity = demand.velocity_at(now_ns)
+        speed = abs(velocity)
+        room = high - place if velocity > 0.0 else place - low
+        stopping = speed * speed / (2.0 * self._quick_stop_deceleration.value)
+        if speed == 0.0 or room > stopping + speed * _TWO_TICKS_S:
+            return False
+        if room <= 0.0:
+            demand.hold(here + room if velocity > 0.0 else here - room)
+        else:
+            demand.brake(now_ns, speed * speed / (2.0 * room))
+        if not self.internal_bits & _LIMITED:
+            self.set_internal_bit(_LIMITED, True)
+        return True
+
+    def overrun_s(self, target: float, distance: float) -> float:
+        """For how long a line over ``distance`` to ``target`` (user frame) may go on without leaving the limits."""
+        if distance == 0.0:
+            return self.period_s
+        low = self._limit_low.value
+        high = self._limit_high.value
+        if low >= high:
+            return self.period_s
+        room = high - target if distance > 0.0 else target - low
+        return self.period_s * min(1.0, max(room, 0.0) / abs(distance))
 
     def to_shaft(self, position: float, demand: float) -> float:
         """The shaft position that shows as ``position`` in the user frame and is nearest to ``demand``."""

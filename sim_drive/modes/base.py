@@ -49,3 +49,10 @@ class OperationMode:
 
     def on_controlword(self, value: int, now_ns: int) -> None:
         """A controlword has been written while the mode is active; 6040h still holds the one before."""
+
+    def halt(self, now_ns: int) -> None:
+        """Controlword bit 8 has been set while the mode is active, or was set when it became so."""
+        self.motion.halt(now_ns)
+
+    def resume(self, now_ns: int) -> None:
+        """Controlword bit 8 has been cleared while the mode is active."""

@@ -195,8 +195,12 @@ def test_display_follows_at_the_next_servo_tick(mode: int):
     assert bench.read(0x6061, signed=True) == mode
 
 
-def test_supported_modes_say_homing_csp_and_the_manufacturers_own():
-    assert Bench().read(0x6502) == 1 << 5 | 1 << 7 | 1 << 16
+def test_supported_modes_are_those_that_6060h_takes():
+    bench = Bench()
+    bits = {1: 0, 3: 2, 4: 3, 6: 5, 7: 6, 8: 7, 9: 8, 10: 9, -2: 16}
+    takes = {mode for mode in range(-128, 128) if bench.write(0x6060, 0, mode, 1) == 0}
+    assert takes - {0} == {mode for mode, bit in bits.items() if bench.read(0x6502) >> bit & 1}
+    assert bench.read(0x6502) & ~sum(1 << bit for bit in bits.values()) == 0
 
 
 def test_mode_written_by_rpdo_is_checked_too():
@@ -204,7 +208,7 @@ def test_mode_written_by_rpdo_is_checked_too():
     bench.map_rpdo(2, 0x305, 255, [0x60400010, 0x60600008])
     bench.nmt(0x01)
     bench.put(0x305, "060008")
-    bench.put(0x305, "060001")
+    bench.put(0x305, "060002")
     bench.tick()
     assert bench.read(0x6060) == 8
     assert bench.read(0x6061) == 8
@@ -214,12 +218,18 @@ def test_mode_written_by_rpdo_is_checked_too():
 # -- quick stop and fault reaction ---------------------------------------------------------------------------------
 
 
-def moving_bench(quick_stop: int = 2, reaction: int = 2) -> Bench:
+RAMPS = {code: {index} for code, index in zip((1, 2, 3, 4), (0x6084, 0x6085, 0x60C6, 0x60C6), strict=True)}
+"""Where the deceleration of an option code stands: slow down, quick stop, limits."""
+RAMPS |= {code + 4: index for code, index in RAMPS.items()} | {0: set()}
+
+
+def moving_bench(quick_stop: int = 0, reaction: int = 0) -> Bench:
     """Enabled in csp at 10000 counts/s, with 100000 counts/s^2 of deceleration: 100 ms and 500 counts to rest."""
     bench = Bench()
     bench.must(0x605A, 0, quick_stop, 2)
     bench.must(0x605E, 0, reaction, 2)
-    bench.must(0x6085, 0, 100_000, 4)
+    for index in (0x6084, 0x6085, 0x60C6):  # the ramp that is not asked for is ten times as steep
+        bench.must(index, 0, 100_000 if index in RAMPS[quick_stop] | RAMPS[reaction] else 1_000_000, 4)
     bench.map_cyclic()
     bench.enable()
     bench.follows = True
@@ -274,7 +284,7 @@ def test_quick_stop_option_zero_disables_at_once():
 
 
 def test_quick_stop_is_parabolic():
-    bench = moving_bench()
+    bench = moving_bench(quick_stop=2, reaction=2)
     bench.control(0x02)
     for _ in range(50):
         bench.tick()
@@ -282,8 +292,9 @@ def test_quick_stop_is_parabolic():
     assert bench.drive.position_demand_counts == pytest.approx(200 + 375, abs=1e-6)
 
 
-def test_fault_reaction_ramps_then_faults():
-    bench = moving_bench(reaction=2)
+@pytest.mark.parametrize("option", [1, 2, 3, 4])
+def test_fault_reaction_ramps_then_faults(option: int):
+    bench = moving_bench(reaction=option)
     bench.drive.trip(0x2310, 0x02, bench.now_ns)
     bench.run(99 * MS)
     assert bench.drive.power_state is REACTION
@@ -301,7 +312,7 @@ def test_fault_reaction_zero_takes_the_torque_away_at_once():
 
 
 def test_fault_during_a_quick_stop_keeps_to_the_ramp():
-    bench = moving_bench()
+    bench = moving_bench(quick_stop=2, reaction=2)
     bench.control(0x02)
     bench.run(50 * MS)
     bench.drive.trip(0x2310, 0x02, bench.now_ns)
@@ -310,9 +321,86 @@ def test_fault_during_a_quick_stop_keeps_to_the_ramp():
     assert bench.shaft == 700
 
 
+@pytest.mark.parametrize(("word", "index", "state"), [(0x07, 0x605C, ON), (0x06, 0x605B, READY)])
+def test_leaving_the_operation_by_ramp_or_at_once(word: int, index: int, state: PowerState):
+    bench = moving_bench()
+    bench.must(index, 0, 0, 2)
+    bench.control(word)
+    assert bench.drive.power_state is state
+    bench = moving_bench(quick_stop=1)  # 6084h is 100000
+    bench.must(index, 0, 1, 2)
+    bench.control(word)
+    bench.run(99 * MS)
+    assert bench.drive.power_state is ENABLED
+    bench.cycle(0, word)  # targets count no more
+    bench.run(MS)
+    assert bench.drive.power_state is state
+    assert bench.shaft == 700
+
+
+def test_enabling_again_calls_the_ramp_off():
+    bench = moving_bench(quick_stop=1)
+    bench.must(0x605C, 0, 1, 2)
+    bench.control(0x07)
+    bench.run(10 * MS)
+    bench.control(0x0F)
+    bench.run(200 * MS)
+    assert bench.drive.power_state is ENABLED
+    assert bench.shaft == 700  # there was no new target, so the ramp ran out
+    bench.cycle(710)
+    assert bench.shaft == 710
+
+
+@pytest.mark.parametrize(("word", "state"), [(0x00, DISABLED), (0x06, READY), (0x02, QUICK)])
+def test_stronger_commands_go_ahead_of_the_ramp(word: int, state: PowerState):
+    bench = moving_bench(quick_stop=2)
+    bench.must(0x605C, 0, 1, 2)
+    bench.must(0x605B, 0, 0, 2)
+    bench.control(0x07)
+    bench.tick()
+    bench.control(word)
+    assert bench.drive.power_state is state
+
+
+# -- halt ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("option", [1, 2, 3, 4])
+def test_halt_stops_csp_and_the_next_target_after_it_counts(option: int):
+    bench = moving_bench(quick_stop=option)
+    bench.must(0x605D, 0, option, 2)
+    bench.set_point(0x10F, 210)
+    bench.sync()
+    bench.run(101 * MS)
+    assert bench.drive.power_state is ENABLED
+    assert bench.shaft == 700
+    bench.cycle(900, 0x10F)
+    assert bench.shaft == 700
+    bench.cycle(710)
+    assert bench.shaft == 710
+
+
+# -- abort connection ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("option", "state"), [(0, ENABLED), (1, REACTION), (2, DISABLED), (3, QUICK)])
+def test_abort_connection_option_on_nmt_stop(option: int, state: PowerState):
+    bench = moving_bench(quick_stop=6, reaction=2)
+    bench.must(0x6007, 0, option, 2)
+    bench.nmt(0x02)
+    assert bench.drive.power_state is state
+
+
 def test_option_codes_that_are_not_there_are_refused():
     bench = Bench()
-    for index, good, bad in ((0x605A, 8, 9), (0x605B, 0, 1), (0x605C, 0, 1), (0x605D, 1, 2), (0x605E, 4, 5)):
+    for index, good, bad in (
+        (0x6007, 3, 4),
+        (0x605A, 8, 9),
+        (0x605B, 1, 2),
+        (0x605C, 1, 2),
+        (0x605D, 4, 5),
+        (0x605E, 4, 5),
+    ):
         assert bench.write(index, 0, good, 2) == 0
         assert bench.write(index, 0, bad, 2) == 0x06090031
         assert bench.write(index, 0, -1, 2) == 0x06090032

@@ -72,7 +72,7 @@ def test_download_without_size_takes_the_objects_own(bench: Bench):
         ("2117100001000000", "80171000" + TOO_SHORT),
         ("2B5A600009000000", "805A6000" + TOO_HIGH),
         ("2B5A6000FFFF0000", "805A6000" + TOO_LOW),
-        ("2F60600001000000", "80606000" + RANGE),  # profile position is not there
+        ("2F60600002000000", "80606000" + RANGE),  # velocity mode (vl) is not there
         ("4003100100000000", "80031001" + NO_DATA),  # no error in the history yet
         ("4000300100000000", "80003001" + NO_DATA),  # empty slot
     ],
@@ -91,7 +91,7 @@ def test_write_only_object_is_not_read(bench: Bench):
 def test_refused_value_leaves_the_object_as_it_was(bench: Bench):
     bench.must(0x6060, 0, 8, 1)
     bench.tick()
-    assert bench.write(0x6060, 0, 1, 1) == 0x06090030
+    assert bench.write(0x6060, 0, 2, 1) == 0x06090030
     bench.tick()
     assert bench.read(0x6060) == 8
     assert bench.read(0x6061) == 8
