@@ -13,13 +13,17 @@ from drivers.sdo import SDO_REQUEST_BASE, AbortCode
 from sim_drive.axis import Axis, Latch, SetPointSource
 from sim_drive.cam_slots import CamDecoder, CamSlots
 from sim_drive.cia402 import Mode, PowerState
+from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.heartbeat import HeartbeatConsumer, HeartbeatProducer
 from sim_drive.nmt_slave import next_state, parse_command
+from sim_drive.node_guarding import NodeGuard
+from sim_drive.parameters import MemoryParameterStore, ParameterMemory, ParametersLost, ParameterStore
 from sim_drive.pdo_slave import ReceivePdo, TransmitPdo
 from sim_drive.sdo_server import SdoServer
 from sim_drive.settings import DriveIdentity, DriveSettings
+from sim_drive.time_of_day import TimeConsumer, TimeOfDay
 
 PDO_COUNT: Final = 4
 """RPDOs and TPDOs that the drive has, each."""
@@ -30,8 +34,6 @@ _NS_PER_S: Final = 1_000_000_000
 _NS_PER_US: Final = 1_000
 _RESERVED_COUNTER_OVERFLOW: Final = 1
 _SYNC_GENERATE: Final = 1 << 30
-_EXTENDED_FRAME: Final = 1 << 29
-_COB_ID_MASK: Final = 0x7FF
 _LAST_COMMUNICATION_INDEX: Final = 0x1FFF
 _LAST_INDEX: Final = 0xFFFF
 
@@ -68,9 +70,17 @@ class Drive:
     """
 
     def __init__(
-        self, node_id: int, dictionary: ObjectDictionary, settings: DriveSettings, decode_cam: CamDecoder
+        self,
+        node_id: int,
+        dictionary: ObjectDictionary,
+        settings: DriveSettings,
+        decode_cam: CamDecoder,
+        store: ParameterStore | None = None,
     ) -> None:
         """Make a drive that is switched off; ``dictionary`` is what ``load_eds`` gives for this node id.
+
+        ``store`` is its non-volatile memory (see ``parameter_file.make_parameter_store``); None: one of its own, which
+        is lost with the drive.
 
         Raises:
             ValueError: ``node_id`` is not 1 to 127, or ``settings.gains`` are not five.
@@ -93,7 +103,10 @@ class Drive:
         sdo_timeout_ns = round(settings.sdo_timeout_s * _NS_PER_S)
         self._sdo = SdoServer(node_id, self.dictionary, self.outbox, sdo_timeout_ns, settings.sdo_block_size)
         self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
-        self._consumer = HeartbeatConsumer(self.dictionary, self._on_heartbeat_change, self._subscribe)
+        self._consumer = HeartbeatConsumer(self.dictionary, self._on_guard_change, self._subscribe)
+        self._guard = NodeGuard(node_id, self.dictionary, self.outbox, self._on_guard_change)
+        self._time = TimeConsumer(self.dictionary, self._subscribe)
+        self._emergency.on_held_back = self._expect_wake
         self._rpdos = [
             ReceivePdo(number, self.dictionary, self.axis, self._emergency, self._on_pdo_change)
             for number in range(1, PDO_COUNT + 1)
@@ -118,6 +131,10 @@ class Drive:
         self._sync_at_ns: int | None = None
         """The last SYNC, noted while there is a synchronous window; None before the first."""
         self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
+        self._memory = ParameterMemory(self.dictionary, store or MemoryParameterStore(), self._on_parameters_saved)
+        if self._memory.stored.values:
+            self._memory.apply(objects.DEVICE_TYPE, _LAST_INDEX)
+            self.axis.restore()
 
         self._handlers: dict[int, _Handler] = {}
         self._request_handlers: dict[int, _RequestHandler] = {}
@@ -170,6 +187,8 @@ class Drive:
                 return
             self._boot_up(now_ns)
         self._consumer.wake(now_ns)
+        self._guard.wake(now_ns)
+        self._emergency.wake(now_ns)
         self._sdo.wake(now_ns)
         if self.nmt_state is NmtState.OPERATIONAL:
             for tpdo in self._event_tpdos:
@@ -198,7 +217,8 @@ class Drive:
             return None
         if self._boot_due_ns is not None:
             return self._boot_due_ns
-        dues = [self._consumer.next_wake_ns(), self._sdo.next_wake_ns(), self._producer.next_wake_ns()]
+        timers = (self._consumer, self._guard, self._emergency, self._sdo, self._producer)
+        dues = [timer.next_wake_ns() for timer in timers]
         if self.nmt_state is NmtState.OPERATIONAL:
             dues += [tpdo.due_ns for tpdo in self._event_tpdos]
             dues += [rpdo.deadline_ns for rpdo in self._monitored_rpdos]
@@ -271,6 +291,10 @@ class Drive:
         """Active mode of operation."""
         return self.axis.mode
 
+    def time_of_day(self, now_ns: int) -> TimeOfDay | None:
+        """What the TIME messages have told, carried on to ``now_ns``; None if none has come."""
+        return self._time.now(now_ns)
+
     def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
         return self.axis.shaft_counts, 0.0, 0
 
@@ -339,6 +363,7 @@ class Drive:
     def _reset(self, is_whole_node: bool, now_ns: int) -> None:
         last_index = _LAST_INDEX if is_whole_node else _LAST_COMMUNICATION_INDEX
         self.dictionary.restore_defaults(objects.DEVICE_TYPE, last_index)
+        self._memory.apply(objects.DEVICE_TYPE, last_index)
         self._sdo.reset()
         for code in _COMMUNICATION_ERRORS:
             self._emergency.end_cause(code, now_ns)
@@ -346,6 +371,7 @@ class Drive:
             self._emergency.forget()
             self.cam_slots.restore()
             self.axis.restore()
+            self._time.forget()
         self._emergency.restore()
         self._handlers = {}
         self._request_handlers = {}
@@ -363,9 +389,22 @@ class Drive:
             pdo.restore(now_ns)
         self._producer.restore(now_ns)
         self._consumer.restore()
+        self._guard.restore()
         self._on_pdo_change(now_ns)
         self._producer.send_boot_up()
         self._enter(NmtState.PRE_OPERATIONAL, now_ns)
+        if self._memory.damage is not None:
+            self._tell_loss(self._memory.damage, now_ns)
+
+    def _tell_loss(self, reason: str, now_ns: int) -> None:
+        if not self._emergency.is_active(EmergencyCode.PARAMETERS_LOST):
+            self.events.append(ParametersLost(now_ns, self.node_id, reason))
+        self._emergency.raise_error(
+            EmergencyCode.PARAMETERS_LOST, ErrorRegister.DEVICE_PROFILE, now_ns, is_fault=False, persists=False
+        )
+
+    def _on_parameters_saved(self, now_ns: int) -> None:
+        self._emergency.end_cause(EmergencyCode.PARAMETERS_LOST, now_ns)
 
     def _enter(self, state: NmtState, now_ns: int) -> None:
         self.nmt_state = state
@@ -408,7 +447,9 @@ class Drive:
         for node_id in self._consumer.node_ids:
             _add(handlers, HEARTBEAT_BASE + node_id, self._heartbeat_handler(node_id))
         is_plain = not self._counter_overflow.value and not self._sync_window.value
-        _add(handlers, self._sync_cob_id.value & _COB_ID_MASK, self._on_sync if is_plain else self._on_noted_sync)
+        _add(handlers, self._sync_cob_id.value & COB_ID_MASK, self._on_sync if is_plain else self._on_noted_sync)
+        if self._time.cob_id is not None:
+            _add(handlers, self._time.cob_id, self._on_time)
         _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
         _add(handlers, NMT_COB_ID, self._on_nmt)
         self._handlers = handlers
@@ -417,6 +458,7 @@ class Drive:
             for tpdo in self._tpdos
             if _is_used(tpdo) and tpdo.is_sent_on_request
         }
+        self._request_handlers[HEARTBEAT_BASE + self.node_id] = self._on_guard_request
         self._is_wake_stale = True
         self.subscriptions_changed = True
 
@@ -473,6 +515,16 @@ class Drive:
             self._consumer.receive(node_id, data, now_ns)
 
         return handle
+
+    def _on_guard_request(self, now_ns: int) -> None:
+        self._guard.on_request(self.nmt_state, now_ns)
+
+    def _on_time(self, data: bytes, now_ns: int) -> None:
+        if self.nmt_state is not NmtState.STOPPED:
+            self._time.receive(data, now_ns)
+
+    def _expect_wake(self) -> None:
+        self._is_wake_stale = True
 
     def _on_sdo(self, data: bytes, now_ns: int) -> None:
         if self.nmt_state in {NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL}:
@@ -538,17 +590,18 @@ class Drive:
         return None
 
     def _on_sync_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
-        if value & (_SYNC_GENERATE | _EXTENDED_FRAME) or not value & _COB_ID_MASK:
+        if value & (_SYNC_GENERATE | EXTENDED_FRAME) or is_restricted(value & COB_ID_MASK):
             return AbortCode.VALUE_RANGE_EXCEEDED
         self._sync_cob_id.value = value
         self._subscribe()
         return None
 
-    # -- heartbeat of the master -----------------------------------------------------------------------------------
+    # -- error control of the master, by heartbeat or guarding -------------------------------------------------------
 
-    def _on_heartbeat_change(self, node_id: int, is_lost: bool, now_ns: int) -> None:
+    def _on_guard_change(self, is_lost: bool, now_ns: int) -> None:
         if not is_lost:
-            self._emergency.end_cause(EmergencyCode.HEARTBEAT, now_ns)
+            if not self._consumer.has_lost and not self._guard.is_lost:
+                self._emergency.end_cause(EmergencyCode.HEARTBEAT, now_ns)
             return
         self.axis.lose_connection(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, persists=True)
         action = self._communication_error.value
