@@ -303,16 +303,29 @@ class GatewayConfig(Model):
                 f"bus.cycle_us: {self.bus.cycle_us} us is too short for {len(self.axes)} axes at "
                 f"{self.bus.bit_rate} bit/s, SYNC and PDOs would take {load:.0%} of it (bound {MAX_BUS_LOAD:.0%})"
             )
-        speed_limit = self.axes[self.axis_names[0]].limits.velocity_rad_per_s
-        if self.speed_rad_per_s > speed_limit:
+        return self
+
+    @model_validator(mode="after")
+    def _master_is_within_its_limits(self) -> Self:
+        name = self.axis_names[0]
+        limits, motion = self.axes[name].limits, self.motion
+        if self.speed_rad_per_s > limits.velocity_rad_per_s:
             raise ValueError(
-                f"motion.speed_rpm: {self.motion.speed_rpm:g} is {self.speed_rad_per_s:.3f} rad/s, above "
-                f"axes.{self.axis_names[0]}.limits.velocity_rad_per_s {speed_limit:g}"
+                f"motion.speed_rpm: {motion.speed_rpm:g} is {self.speed_rad_per_s:.3f} rad/s, above "
+                f"axes.{name}.limits.velocity_rad_per_s {limits.velocity_rad_per_s:g}"
             )
-        acceleration_limit = self.axes[self.axis_names[0]].limits.acceleration_rad_per_s2
-        if self.motion.ramp_acceleration_rad_per_s2 > acceleration_limit:
+        if motion.ramp_acceleration_rad_per_s2 > limits.acceleration_rad_per_s2:
             raise ValueError(
-                f"motion.ramp_acceleration_rad_per_s2: {self.motion.ramp_acceleration_rad_per_s2:g} is above "
-                f"axes.{self.axis_names[0]}.limits.acceleration_rad_per_s2 {acceleration_limit:g}"
+                f"motion.ramp_acceleration_rad_per_s2: {motion.ramp_acceleration_rad_per_s2:g} is above "
+                f"axes.{name}.limits.acceleration_rad_per_s2 {limits.acceleration_rad_per_s2:g}"
+            )
+        if limits.jerk_rad_per_s3 is not None and motion.ramp_jerk_rad_per_s3 > limits.jerk_rad_per_s3:
+            raise ValueError(
+                f"motion.ramp_jerk_rad_per_s3: {motion.ramp_jerk_rad_per_s3:g} is above "
+                f"axes.{name}.limits.jerk_rad_per_s3 {limits.jerk_rad_per_s3:g}"
+            )
+        if limits.position_deg is not None:
+            raise ValueError(
+                f"axes.{name}.limits.position_deg: the master turns without end and can have no such limit"
             )
         return self

@@ -57,6 +57,16 @@ def config(tmp_path):
         ("cycle_us: 1000", "cycle_us: 1001", "bus.cycle_us: 1001 cannot be said in 60C2h"),
         ("cycle_us: 1000", "cycle_us: 500", "bus.cycle_us: 500 us is too short for 2 axes at 1000000 bit/s"),
         ("speed_rpm: 60", "speed_rpm: 200", "motion.speed_rpm: 200 is 20.944 rad/s, above"),
+        (
+            "      velocity_rad_per_s: 14.0",
+            "      position_deg: [-10, 10]\n      velocity_rad_per_s: 14.0",
+            "axes.cv.limits.position_deg: the master turns without end",
+        ),
+        (
+            "      velocity_rad_per_s: 14.0",
+            "      jerk_rad_per_s3: 29.0\n      velocity_rad_per_s: 14.0",
+            "motion.ramp_jerk_rad_per_s3: 30 is above axes.cv.limits.jerk_rad_per_s3 29",
+        ),
         ("role: slave", "role: master", "there must be one axis with role master and one with role slave"),
         ("name: paper", "name: paper\nname: twice", "line 5: key 'name' is given twice"),
         ("name: paper", "name: [", "not valid YAML"),
