@@ -320,7 +320,7 @@ class Axis(Motion):
             return
         demand = self.demand.at(now_ns)
         self.position_demand_counts = demand
-        if state is _OPERATION_ENABLED and self._after_ramp is None:
+        if self._active is not None:
             if self.is_guarded and now_ns - self.set_point_at_ns > self.set_point_timeout_ns:
                 self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
                 return

@@ -51,8 +51,6 @@ class Motion(ABC):
         "_acceleration",
         "_deceleration",
         "_halt_option",
-        "_limit_high",
-        "_limit_low",
         "_max_acceleration",
         "_max_deceleration",
         "_max_profile_velocity",
@@ -66,6 +64,8 @@ class Motion(ABC):
         "is_guarded",
         "is_halted",
         "latch",
+        "limit_high",
+        "limit_low",
         "offset",
         "period_ns",
         "period_s",
@@ -112,8 +112,8 @@ class Motion(ABC):
         self._max_profile_velocity = self.entry(objects.MAX_PROFILE_VELOCITY)
         self._max_speed = self.entry(objects.MAX_MOTOR_SPEED)
         self._halt_option = self.entry(objects.HALT_OPTION_CODE)
-        self._limit_low = self.entry(objects.SOFTWARE_POSITION_LIMIT, 1)
-        self._limit_high = self.entry(objects.SOFTWARE_POSITION_LIMIT, 2)
+        self.limit_low = self.entry(objects.SOFTWARE_POSITION_LIMIT, 1)
+        self.limit_high = self.entry(objects.SOFTWARE_POSITION_LIMIT, 2)
 
     def entry(self, index: int, subindex: int = 0) -> Entry:
         """The entry of an object of the axis."""
@@ -150,8 +150,8 @@ class Motion(ABC):
 
     def within_limits(self, target: int) -> int:
         """``target`` (user frame), or the software position limit 607Dh that it is beyond; bit 11 shows which."""
-        low = self._limit_low.value
-        high = self._limit_high.value
+        low = self.limit_low.value
+        high = self.limit_high.value
         is_limited = low < high and not low <= target <= high
         if is_limited:
             target = low if target < low else high
@@ -216,8 +216,8 @@ class Motion(ABC):
         It is to be asked at every servo tick: it brakes as late as the quick stop deceleration allows, and then with
         what it takes to stand at the limit.
         """
-        low = self._limit_low.value
-        high = self._limit_high.value
+        low = self.limit_low.value
+        high = self.limit_high.value
         if low >= high or (low == -_HALF and high == _HALF - 1):
             return False
         demand = self.demand
@@ -244,8 +244,8 @@ class Motion(ABC):
         """For how long a line over ``distance`` to ``target`` (user frame) may go on without leaving the limits."""
         if distance == 0.0:
             return self.period_s
-        low = self._limit_low.value
-        high = self._limit_high.value
+        low = self.limit_low.value
+        high = self.limit_high.value
         if low >= high:
             return self.period_s
         room = high - target if distance > 0.0 else target - low

@@ -73,11 +73,17 @@ class CyclicPosition(OperationMode):
         offset = self._offset.value
         if offset:
             target = wrap_int32(target + offset)
-        target = motion.within_limits(target)
+        low = motion.limit_low.value
+        high = motion.limit_high.value
+        # What is within the limits, as it nearly always is, is followed without a call.
+        if motion.internal_bits or not low <= target <= high:
+            target = motion.within_limits(target)
         demand = motion.demand
         start = demand.at(now_ns)
         shaft = motion.to_shaft(target, start)
-        overrun_s = motion.overrun_s(target, shaft - start) if is_cyclic else 0.0
+        overrun_s = motion.period_s if is_cyclic else 0.0
+        if is_cyclic and not low <= target + shaft - start <= high:
+            overrun_s = motion.overrun_s(target, shaft - start)
         demand.go_from(start, shaft, now_ns, motion.period_s, overrun_s)
 
 
