@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from config.quirks import Quirk
+
 
 @dataclass(frozen=True, slots=True)
 class DriveIdentity:
@@ -36,5 +38,7 @@ class DriveSettings:
     """Segments in a sub-block of a block download, 1 to 127."""
     boot_up_delay_s: float = 0.0
     """From power-on or a reset to the boot-up message."""
+    quirks: frozenset[Quirk] = frozenset()
+    """Habits of real drives that it has."""
     parameter_file: Path | None = None
     """Where parameters are stored (1010h) over the end of the process; None: nowhere."""
