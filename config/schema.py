@@ -7,6 +7,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from config.quirks import Quirk
 from drivers.frame import WORST_CASE_BITS
 from drivers.nmt import MAX_NODE_ID
 
@@ -134,6 +135,8 @@ class EmulatedDriveSection(Model):
     viscous_Nms: NotNegative = 0.0
     brake_torque_Nm: NotNegative
     resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    quirks: frozenset[Quirk] = frozenset()
+    """Habits of real drives that the emulated one is to have."""
 
 
 class Role(Enum):
