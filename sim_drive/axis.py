@@ -8,6 +8,7 @@ from collections.abc import Callable
 from math import floor
 from typing import Final
 
+from config.quirks import Quirk
 from drivers import objects
 from drivers.node import Event
 from drivers.sdo import AbortCode
@@ -38,6 +39,7 @@ from sim_drive.modes.profile_position import ProfilePosition
 from sim_drive.modes.profile_torque import ProfileTorque
 from sim_drive.modes.profile_velocity import ProfileVelocity
 from sim_drive.motion import Latch, Motion, SetPointSource, wrap_int32
+from sim_drive.quirks import MODE_SWITCH_NS
 from sim_drive.settings import DriveSettings
 
 __all__ = ["CONTROLLER_GAIN_COUNT", "FOLLOWING_ERROR_WINDOW_OFF", "Axis", "Latch", "SetPointSource", "wrap_int32"]
@@ -83,7 +85,9 @@ class Axis(Motion):
     __slots__ = (
         "_active",
         "_after_ramp",
+        "_coming_mode",
         "_emergency",
+        "_enabled_bits",
         "_events",
         "_following_error",
         "_following_error_since_ns",
@@ -180,6 +184,11 @@ class Axis(Motion):
         """The state that is next when the axis has come to rest."""
         self._following_error_since_ns: int | None = None
         self._sampled_at_ns = -1
+        self._coming_mode: tuple[int, int] | None = None
+        """With a slow mode switch: the mode, and when it is entered."""
+        is_odd = Quirk.SET_POINT_ACKNOWLEDGE_STAYS in settings.quirks
+        self._enabled_bits = int(Statusword.SET_POINT_ACKNOWLEDGE) if is_odd else 0
+        """Set in the statusword whenever operation is enabled."""
         self.gains: tuple[int, ...] = ()
         self.restore()
 
@@ -304,7 +313,7 @@ class Axis(Motion):
     def on_tick(self, now_ns: int, shaft_counts: int) -> None:
         """One servo period: bring the demand up to ``now_ns`` and run what depends on time."""
         self.shaft_counts = shaft_counts
-        if self._mode_entry.value != self._mode:
+        if self._mode_entry.value != self._mode and self._is_mode_due(now_ns):
             self._switch_mode(now_ns)
         state = self._state
         if not self.is_powered:
@@ -511,6 +520,18 @@ class Axis(Motion):
     def _on_mode(self, value: int, now_ns: int) -> AbortCode | None:
         return None if value in MODES else AbortCode.VALUE_RANGE_EXCEEDED
 
+    def _is_mode_due(self, now_ns: int) -> bool:
+        """Whether the mode that 6060h asks for is to be entered now; a slow drive takes its time."""
+        if Quirk.SLOW_MODE_SWITCH not in self.settings.quirks:
+            return True
+        wanted: int = self._mode_entry.value
+        if self._coming_mode is None or self._coming_mode[0] != wanted:
+            self._coming_mode = wanted, now_ns + MODE_SWITCH_NS
+        if now_ns < self._coming_mode[1]:
+            return False
+        self._coming_mode = None
+        return True
+
     def _switch_mode(self, now_ns: int) -> None:
         self._mode = MODES[self._mode_entry.value]
         self._idle_controlword = _NO_CONTROLWORD
@@ -562,7 +583,10 @@ class Axis(Motion):
         """Compose statusword and modes of operation display."""
         mode = self._modes[self._mode]
         internal = self.internal_bits & _LIMITED if mode.owns_bit_13 else self.internal_bits
-        self._statusword.value = STATE_BITS[self._state] | _BASE_BITS | internal | mode.status_bits
+        word = STATE_BITS[self._state] | _BASE_BITS | internal | mode.status_bits
+        if self._state is _OPERATION_ENABLED:
+            word |= self._enabled_bits
+        self._statusword.value = word
         self._mode_display.value = int(self._mode)
 
 
