@@ -4,12 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from config.quirks import Quirk
 from drivers import objects
 from drivers.frame import Frame
 from drivers.nmt import HEARTBEAT_BASE, MAX_NODE_ID, NMT_COB_ID, NmtCommand, NmtState
 from drivers.node import Event
 from drivers.object_dictionary import ObjectDictionary
-from drivers.sdo import SDO_REQUEST_BASE, AbortCode
+from drivers.sdo import SDO_REQUEST_BASE, AbortCode, ClientCommand
 from sim_drive.axis import Axis, Latch, SetPointSource
 from sim_drive.cam_slots import CamDecoder, CamSlots
 from sim_drive.cia402 import Mode, PowerState
@@ -21,6 +22,7 @@ from sim_drive.nmt_slave import next_state, parse_command
 from sim_drive.node_guarding import NodeGuard
 from sim_drive.parameters import MemoryParameterStore, ParameterMemory, ParametersLost, ParameterStore
 from sim_drive.pdo_slave import ReceivePdo, TransmitPdo
+from sim_drive.quirks import apply_quirks
 from sim_drive.sdo_server import SdoServer
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.time_of_day import TimeConsumer, TimeOfDay
@@ -51,6 +53,8 @@ _OPERATIONAL: Final = NmtState.OPERATIONAL
 _SDO: Final = SetPointSource.SDO
 _SYNC: Final = SetPointSource.SYNC
 
+_BLOCK_COMMANDS: Final = frozenset({int(ClientCommand.BLOCK_DOWNLOAD), int(ClientCommand.BLOCK_UPLOAD)})
+_UNKNOWN_COMMAND: Final = 0xE0
 _Handler = Callable[[bytes, int], None]
 _RequestHandler = Callable[[int], None]
 
@@ -146,6 +150,7 @@ class Drive:
         """Without supply, by ``switch_off``."""
         self._next_wake_ns: int | None = 0
         self._is_wake_stale = False
+        apply_quirks(self)
 
     # -- the seam ------------------------------------------------------------------------------------------------
 
@@ -392,6 +397,10 @@ class Drive:
         self._guard.restore()
         self._on_pdo_change(now_ns)
         self._producer.send_boot_up()
+        if Quirk.NO_BOOT_UP in self.settings.quirks:
+            self.outbox.pop()
+        elif Quirk.SHORT_BOOT_UP in self.settings.quirks:
+            self.outbox.append(Frame(self.outbox.pop().cob_id))
         self._enter(NmtState.PRE_OPERATIONAL, now_ns)
         if self._memory.damage is not None:
             self._tell_loss(self._memory.damage, now_ns)
@@ -467,10 +476,29 @@ class Drive:
         window_ns = self._sync_window.value * _NS_PER_US if rpdo.is_synchronous else 0
         if window_ns or rpdo.event_ns:
             return self._guarded_rpdo_handler(rpdo, window_ns)
+        if rpdo.is_synchronous and Quirk.RPDO_ACTS_ON_RECEIPT in self.settings.quirks:
+            return self._hasty_rpdo_handler(rpdo)
 
         def handle(data: bytes, now_ns: int) -> None:
             if self.nmt_state is _OPERATIONAL:
                 receive(data, now_ns)
+
+        return handle
+
+    def _hasty_rpdo_handler(self, rpdo: ReceivePdo) -> _Handler:
+        """A synchronous RPDO acts without waiting for the SYNC, as if one had come with it."""
+
+        def handle(data: bytes, now_ns: int) -> None:
+            if self.nmt_state is not _OPERATIONAL:
+                return
+            rpdo.receive(data, now_ns)
+            pending = rpdo.pending
+            if pending is not None:
+                rpdo.pending = None
+                self.axis.source = _SYNC
+                rpdo.apply(pending, now_ns)
+                self.axis.on_sync(now_ns)
+                self.axis.source = _SDO
 
         return handle
 
@@ -529,6 +557,9 @@ class Drive:
     def _on_sdo(self, data: bytes, now_ns: int) -> None:
         if self.nmt_state in {NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL}:
             self._is_wake_stale = True
+            if data and data[0] >> 5 in _BLOCK_COMMANDS and Quirk.NO_BLOCK_TRANSFER in self.settings.quirks:
+                # A command that no server knows, so that this one answers as to any other.
+                data = bytes((_UNKNOWN_COMMAND, *data[1:]))
             self._sdo.receive(data, now_ns)
 
     # -- SYNC ----------------------------------------------------------------------------------------------------
