@@ -98,6 +98,7 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
         rated_torque_Nm=axis.rated_torque_Nm,
         gains=(gains.K_P, gains.K_I, gains.K_D, gains.K_V, gains.K_F),
         missing_set_point_limit=config.emulator.missing_sync_limit,
+        quirks=axis.emulation.quirks,
     )
 
 
