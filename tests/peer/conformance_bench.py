@@ -1,4 +1,4 @@
-"""A bus in virtual time with emulated drives on it: frames in and out as text (``605#4000100000000000``), instants in ms.
+"""A bus in virtual time with emulated drives on it: frames as text (``605#4000100000000000``), spans in ms.
 
 The bench knows no service of CANopen but the two lines of an SDO transfer that fits into one frame; what is sent, and
 what has to come back, stands in the tests.

@@ -5,6 +5,7 @@ SDO aborts by row: ``06040041h`` object cannot be mapped, ``06040042h`` PDO too 
 """
 
 import configparser
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -371,7 +372,7 @@ def test_row_13_start_value_of_the_sync_counter(bus: Bus):
     assert counts[:2] == [0, 0]
     assert sum(counts) in {4, 5}  # counted from the third SYNC on: 3 itself, or the second after it
     places = [place for place, count in enumerate(counts) if count]
-    assert {b - a for a, b in zip(places, places[1:], strict=False)} == {2}
+    assert {b - a for a, b in pairwise(places)} == {2}
 
 
 def test_row_13_what_comes_after_the_synchronous_window_is_not_used(bus: Bus):
@@ -445,7 +446,7 @@ def test_row_14_event_timer_in_ms_restarts_when_the_pdo_is_sent(bus: Bus):
     event_driven(bus, event="1400")  # 20 ms
     bus.send(START)
     times = [at for at, text in bus.run_timed(101) if text.startswith("185#")]
-    assert [round(b - a, 6) for a, b in zip(times, times[1:], strict=False)] == [20.0] * (len(times) - 1)
+    assert [round(b - a, 6) for a, b in pairwise(times)] == [20.0] * (len(times) - 1)
     assert len(times) >= 5
     # An event 9 ms after the last one: the next is 20 ms after that.
     bus.run(20 - (101 - times[-1]) + 9)
@@ -453,14 +454,14 @@ def test_row_14_event_timer_in_ms_restarts_when_the_pdo_is_sent(bus: Bus):
     times = [at for at, text in bus.run_timed(45) if text.startswith("185#")]
     assert len(times) == 3
     assert times[0] < 2
-    assert [round(b - a, 6) for a, b in zip(times, times[1:], strict=False)] == [20.0, 20.0]
+    assert [round(b - a, 6) for a, b in pairwise(times)] == [20.0, 20.0]
 
 
 def test_row_14_inhibit_time_holds_for_the_event_timer_too(bus: Bus):
     event_driven(bus, inhibit="F401", event="1400")  # 50 ms and 20 ms
     bus.send(START)
     times = [at for at, text in bus.run_timed(1000) if text.startswith("185#")]
-    assert min(b - a for a, b in zip(times, times[1:], strict=False)) >= 50.0
+    assert min(b - a for a, b in pairwise(times)) >= 50.0
 
 
 def test_row_14_a_jittering_encoder_does_not_flood_the_bus():

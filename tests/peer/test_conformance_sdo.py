@@ -101,7 +101,8 @@ def test_row_04_and_08_a_service_without_its_initiate_is_unknown(bus: Bus, reque
     ],
 )
 @pytest.mark.parametrize(
-    "form", ["40{}00000000", "23{}00000000", "2F{}00000000", "21{}04000000", "20{}00000000", "A4{}7F000000", "C6{}04000000"]
+    "form",
+    ["40{}00000000", "23{}00000000", "2F{}00000000", "21{}04000000", "20{}00000000", "A4{}7F000000", "C6{}04000000"]
 )  # fmt: skip
 def test_row_05_existence_of_index_and_subindex(bus: Bus, place: str, code: int, form: str):
     assert bus.abort(form.format(place)) == code
@@ -113,7 +114,8 @@ def test_row_05_existence_of_index_and_subindex(bus: Bus, place: str, code: int,
 
 @pytest.mark.parametrize("place", ["001000", "416000", "646000", "181001", "081000", "026500"])
 @pytest.mark.parametrize(
-    "form", ["23{}00000000", "2F{}00000000", "22{}00000000", "21{}04000000", "20{}00000000", "C6{}04000000", "C0{}00000000"]
+    "form",
+    ["23{}00000000", "2F{}00000000", "22{}00000000", "21{}04000000", "20{}00000000", "C6{}04000000", "C0{}00000000"]
 )  # fmt: skip
 def test_row_06_read_only_is_refused_at_the_initiate(bus: Bus, place: str, form: str):
     """Of all three transfers; before a word about the length."""
