@@ -38,7 +38,7 @@ _Check = Callable[[int], AbortCode | None]
 
 
 def apply_quirks(drive: "Drive") -> None:
-    """Put the habits that ``drive.settings.quirks`` names before the dictionary's own checks; once, after they stand."""
+    """Put the habits of ``drive.settings.quirks`` before the dictionary's own checks; once, when those are there."""
     for quirk in Quirk:
         if quirk in drive.settings.quirks and quirk in _APPLY:
             _APPLY[quirk](drive)
