@@ -16,12 +16,14 @@ from typing import Final
 
 from config.loading import parse_config
 from drivers.errors import BusError, DriveError
+from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
 from drivers.node import Event
 from drivers.ports import Port
 from drivers.real_time import try_realtime
 from gateway.bus_address import BusAddress
 from gateway.child_process import end_with
 from gateway.core import GatewayCore
+from gateway.errors import GatewayError
 from gateway.event_text import describe
 from gateway.guard import StopReason
 from gateway.preparation import build_core, plan
@@ -29,6 +31,9 @@ from gateway.ring import RingWriter, RunState, StopRequest
 from mechanism.cam_file import parse_cam_file
 
 MAX_WAIT_S: Final = 0.05
+LISTENING_S: Final = 0.5
+"""How long the bus is listened to at least before anything is sent on it; a socketcand server may keep frames from a
+client for some tenths of a second after the greeting."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,23 @@ def run_core(core: GatewayCore, port: Port, clock: Callable[[], int], poll: Call
             poll()
 
 
+def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None:
+    """Listen for ``span_s``, and refuse a bus that somebody else commands: two masters reset each other's drives.
+
+    Raises GatewayError, and BusError when the bus goes away.
+    """
+    telltales = {SYNC_COB_ID: "SYNC", HEARTBEAT_BASE + gateway_node_id: f"the heartbeat of node {gateway_node_id}"}
+    end_s = time.monotonic() + span_s
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        received = port.receive()
+        if received is None:
+            port.wait(left_s)
+            continue
+        sign = telltales.get(received[0].cob_id)
+        if sign is not None:
+            raise GatewayError(f"somebody else commands this bus: {sign} is on it, is another run going on?")
+
+
 def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
     """Hand a stop request to the core, once: a quick stop asked for again would undo the disabling that follows it.
 
@@ -144,12 +166,15 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
                 f"{setting.feature.value} {state}: {setting.reason}",
                 is_on=setting.is_on,
             )
+        refuse_other_master(port, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
         ring.set_state(RunState.RUNNING)
         run_core(core, port, time.monotonic_ns, poll)
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:
         failure = error
+    except GatewayError as error:
+        failure, stopped_by = error, StopReason.COMMISSIONING
     finally:
         if port is not None:
             port.close()

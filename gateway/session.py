@@ -16,8 +16,6 @@ from types import FrameType
 from typing import Any, Final
 
 from drivers.errors import BusError
-from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
-from drivers.ports import Port
 from gateway.bus_address import BusAddress
 from gateway.cyclic_process import CyclicJob
 from gateway.errors import GatewayError
@@ -31,8 +29,6 @@ PROCESS_TIMEOUT_S: Final = 15.0
 """How long the cyclic process may take to end when it is not watched any more, before it is terminated."""
 HUNG_S: Final = 3.0
 """A running cyclic process that has given no sign of life for so long is killed: the drives then stop by themselves."""
-LISTENING_S: Final = 0.1
-"""How long the bus is listened to at least before anything is sent on it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,23 +82,6 @@ def _python_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(part for part in (root, known) if part)}
 
 
-def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None:
-    """Listen for ``span_s``, and refuse a bus that somebody else commands: two masters reset each other's drives.
-
-    Raises GatewayError, and BusError when the bus goes away.
-    """
-    telltales = {SYNC_COB_ID: "SYNC", HEARTBEAT_BASE + gateway_node_id: f"the heartbeat of node {gateway_node_id}"}
-    end_s = time.monotonic() + span_s
-    while (left_s := end_s - time.monotonic()) > 0.0:
-        received = port.receive()
-        if received is None:
-            port.wait(left_s)
-            continue
-        sign = telltales.get(received[0].cob_id)
-        if sign is not None:
-            raise GatewayError(f"somebody else commands this bus: {sign} is on it, is another run going on?")
-
-
 def run_realtime(
     prepared: PreparedRun,
     address: BusAddress,
@@ -125,12 +104,8 @@ def run_realtime(
     config = prepared.config
     constants = RunConstants.from_config(config, prepared.cam.closure)
     failures: list[str] = []
-    # A bus that is not there, or not free, is told before a recording is begun.
-    port = address.open()
-    try:
-        refuse_other_master(port, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
-    finally:
-        port.close()
+    # A bus that is not there is told before a recording is begun.
+    address.open().close()
     start_ns = time.monotonic_ns()
     start_wall_ns = time.time_ns()
     with RingWriter.create(config.name, constants) as ring, tempfile.TemporaryDirectory() as folder:

@@ -13,10 +13,10 @@ import pytest
 from config.loading import load_config
 from drivers.frame import Frame
 from gateway.bus_address import resolve_bus
-from gateway.cyclic_process import pass_on_stop, run_core
+from gateway.cyclic_process import pass_on_stop, refuse_other_master, run_core
 from gateway.errors import GatewayError
 from gateway.ring import StopRequest
-from gateway.session import StopSwitch, refuse_other_master
+from gateway.session import StopSwitch
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
