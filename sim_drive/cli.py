@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 import typer
 
 from config.loading import ConfigError, load_config
+from config.quirks import Quirk
 from config.schema import BusSection, GatewayConfig
 from drivers.errors import BusError, DriveError
 from drivers.nmt import MAX_NODE_ID
@@ -25,6 +26,7 @@ from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_real
 from mechanism.errors import MechanismError
 from sim_drive.faults import Fault, describe_faults
 from sim_drive.scenario import Scenario, load_scenario, parse_fault
+from sim_drive.settings import DriveSettings
 from sim_drive.socketcand_server import SocketcandServer
 
 if TYPE_CHECKING:
@@ -46,6 +48,7 @@ _EPILOG: Final = """Examples:
   sim-drive paper --fault "servo over_current at_s=3" --fault "1 lost_frames cob_id=0x181 probability=0.01"
   sim-drive paper --scenario trouble.yaml    the same in a file, faults: [{node: servo, kind: over_current, at_s: 3}]
   sim-drive --list-faults                    every kind of fault, and what it takes
+  sim-drive paper --quirk slow_mode_switch   a habit of real drives, see --help; in CONFIG: emulation.quirks of an axis
 
 Connect to it, over socketcand, with python-can:
 
@@ -132,6 +135,10 @@ def sim_drive(
         bool,
         typer.Option("--list-faults", help="List all faults and exit.", callback=_print_faults, is_eager=True),
     ] = False,
+    quirk: Annotated[
+        list[Quirk] | None,
+        typer.Option(help="A habit of real drives that all have; may be given several times."),
+    ] = None,
     interface: Annotated[
         str | None, typer.Option(help="auto, socketcan, socketcand or a python-can interface  [default: from CONFIG]")
     ] = None,
@@ -170,7 +177,7 @@ def sim_drive(
     announcement = _Announcement(as_json, ready_file, ready_fd)
 
     def build() -> Node:
-        machine = _build(fleet, trouble, seed)
+        machine = _build(fleet, frozenset(quirk or ()), trouble, seed)
         _prepare_process(realtime)
         return machine
 
@@ -259,13 +266,28 @@ def _scenario(file: Path | None, words: Sequence[str], fleet: _Fleet) -> Scenari
     return Scenario((*scenario.faults, *further), scenario.seed, scenario.name)
 
 
-def _build(fleet: _Fleet, scenario: Scenario, seed: int) -> "EmulatedMachine | Injector":
+def _build(fleet: _Fleet, quirks: frozenset[Quirk], scenario: Scenario, seed: int) -> "EmulatedMachine | Injector":
     # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
-    from sim_drive.assembly import build_machine, free_machine
+    from sim_drive.assembly import FREE_AXIS_GAINS, build_machine, free_machine
     from sim_drive.injector import Injector
 
-    machine = free_machine(fleet.node_ids, seed=seed) if fleet.config is None else build_machine(fleet.config, seed)
+    if fleet.config is None:
+        settings = DriveSettings(gains=FREE_AXIS_GAINS, quirks=quirks)
+        machine = free_machine(fleet.node_ids, settings=settings, seed=seed)
+    else:
+        machine = build_machine(_with_quirks(fleet.config, quirks), seed)
     return Injector(machine, scenario.faults, scenario.seed ^ seed) if scenario.faults else machine
+
+
+def _with_quirks(config: GatewayConfig, quirks: frozenset[Quirk]) -> GatewayConfig:
+    """The configuration with further quirks for every axis."""
+    axes = {
+        name: axis.model_copy(
+            update={"emulation": axis.emulation.model_copy(update={"quirks": axis.emulation.quirks | quirks})}
+        )
+        for name, axis in config.axes.items()
+    }
+    return config.model_copy(update={"axes": axes})
 
 
 def _fault_reporter(as_json: bool) -> Callable[[Event], None]:

@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from config.loading import ConfigError
+from config.loading import ConfigError, load_config, parse_config
+from config.quirks import Quirk
+from drivers.frame import Frame
+from drivers.ports import open_port
 from sim_drive.cli import parse_node_ids
 from sim_drive.faults import FaultKind
 
@@ -104,3 +107,57 @@ def test_faults_of_a_file_and_of_the_command_line_happen_and_are_told(tmp_path: 
     assert (lines[0]["event"], lines[-1]["event"]) == ("ready", "stopped")
     assert "sim-drive: node 9: over_current begins" in done.stderr
     assert "sim-drive: a row of 2 free axes is on socketcand" in done.stderr
+
+
+def test_an_unknown_quirk_in_a_configuration_is_refused_with_the_known_ones() -> None:
+    config = load_config("paper")
+    text = config.text.replace("    emulation:\n", "    emulation:\n      quirks: [slow_mode_switch, moody]\n", 1)
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text, config.path)
+    (problem,) = caught.value.problems
+    assert "emulation.quirks" in problem
+    assert "'moody' should be 'no_boot_up'" in problem
+
+
+def test_an_unknown_quirk_on_the_command_line_is_wrong_use() -> None:
+    done = run("paper", "--quirk", "moody")
+    assert done.returncode == 2
+    assert "'moody'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("fleet", [("--nodes", "1-2"), ("paper",)])
+def test_a_quirk_of_the_command_line_is_on_the_bus(fleet: tuple[str, ...]) -> None:
+    """Reset node: with a short boot-up, 701h and 702h have no data."""
+    command = [
+        *COMMAND,
+        *fleet,
+        "--quirk",
+        Quirk.SHORT_BOOT_UP.value,
+        "--interface",
+        "socketcand",
+        "--port",
+        "0",
+        "--json",
+    ]
+    with subprocess.Popen(
+        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            place = json.loads(process.stdout.readline())
+            bus = open_port("socketcand", place["channel"], port=place["port"])
+            try:
+                bus.send(Frame(0x000, b"\x81\x00"))
+                seen: dict[int, bytes] = {}
+                for _ in range(1000):
+                    received = bus.receive()
+                    if received is not None:
+                        seen[received[0].cob_id] = received[0].data
+                    elif seen.keys() >= {0x701, 0x702} or not bus.wait(PATIENCE_S):
+                        break
+                assert (seen.get(0x701), seen.get(0x702)) == (b"", b"")
+            finally:
+                bus.close()
+        finally:
+            process.terminate()
