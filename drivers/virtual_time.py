@@ -66,6 +66,29 @@ class VirtualBus:
     From within ``on_event`` or ``condition``, call ``refresh`` afterwards.
     """
 
+    __slots__ = (
+        "_busy_ns",
+        "_earliest_wake_ns",
+        "_faults",
+        "_frame_count",
+        "_frame_end_ns",
+        "_late",
+        "_late_count",
+        "_listeners",
+        "_now_ns",
+        "_numbered_queues",
+        "_on_event",
+        "_on_wire",
+        "_queues",
+        "_sender",
+        "_source",
+        "_trace",
+        "_wakes",
+        "_wire_ns",
+        "bit_rate",
+        "nodes",
+    )
+
     def __init__(
         self,
         nodes: Sequence[Node],

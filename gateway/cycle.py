@@ -99,6 +99,40 @@ class CyclicLoop:
     of frames to the bus.
     """
 
+    __slots__ = (
+        "_all_axes",
+        "_applied",
+        "_arrival_ns",
+        "_awaited",
+        "_cpu_clock",
+        "_cpu_last_ns",
+        "_cpu_ns",
+        "_deadline_share_ns",
+        "_demand",
+        "_flags",
+        "_in_force",
+        "_is_closed",
+        "_no_torque_offsets",
+        "_no_velocities",
+        "_sent",
+        "_sent_ns",
+        "_sink",
+        "_sync_deviation_ns",
+        "_sync_due_ns",
+        "_sync_ns",
+        "_sync_period_ns",
+        "actuals_are_valid",
+        "axes",
+        "cycle",
+        "guard",
+        "is_guarding_enabled",
+        "is_running",
+        "outbox",
+        "period_ns",
+        "phase",
+        "tpdo_slots",
+    )
+
     def __init__(
         self,
         axes: list[AxisChannel],

@@ -160,6 +160,7 @@ class _Motor:
         "counts",
         "counts_per_rad",
         "drive",
+        "due_ns",
         "events",
         "index",
         "is_powered",
@@ -187,8 +188,10 @@ class _Motor:
         """Counts/s, over the last servo period."""
         self.is_powered = False
         self.tap: DriveTap | None = None
-        self.wake_ns = _NEVER
-        """When the drive wants to be woken, as it was asked last."""
+        self.wake_ns: int | None = None
+        """When the drive wanted to be woken when it was asked last."""
+        self.due_ns = _NEVER
+        """When it will be woken."""
         # Looked up once: they are asked for at every frame and tick.
         self.receive = drive.receive
         self.next_wake_ns = drive.next_wake_ns
@@ -330,7 +333,9 @@ class EmulatedMachine:
             return
         for motor in listeners:
             motor.receive(frame, now_ns)
-            self._ask_wake(motor)
+            wake_ns = motor.next_wake_ns()
+            if wake_ns != motor.wake_ns:
+                self._set_wake(motor, wake_ns)
         self._listen(now_ns)
 
     def next_wake_ns(self) -> int | None:
@@ -345,7 +350,7 @@ class EmulatedMachine:
             if self._due_ns == self._next_tick_ns:
                 self._run_tick(self._due_ns)
             else:
-                due = next(motor for motor in self._motors if motor.wake_ns == self._due_ns)
+                due = next(motor for motor in self._motors if motor.due_ns == self._due_ns)
                 self._wake_drive(due, self._due_ns)
 
     def take_frames(self) -> list[Frame]:
@@ -363,18 +368,15 @@ class EmulatedMachine:
         return events
 
     def _ask_wake(self, motor: _Motor) -> None:
-        wake_ns = motor.next_wake_ns()
-        if wake_ns is None:
-            wake_ns = _NEVER
-        if wake_ns != motor.wake_ns:
-            self._set_wake(motor, wake_ns)
+        self._set_wake(motor, motor.next_wake_ns())
 
-    def _set_wake(self, motor: _Motor, wake_ns: int) -> None:
+    def _set_wake(self, motor: _Motor, wake_ns: int | None) -> None:
         motor.wake_ns = wake_ns
+        motor.due_ns = _NEVER if wake_ns is None else wake_ns
         self._find_due()
 
     def _find_due(self) -> None:
-        self._due_ns = min(self._next_tick_ns, *[motor.wake_ns for motor in self._motors])
+        self._due_ns = min(self._next_tick_ns, *[motor.due_ns for motor in self._motors])
 
     def _wake_drive(self, motor: _Motor, due_ns: int) -> None:
         # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
@@ -382,7 +384,7 @@ class EmulatedMachine:
         for _ in range(_MAX_WAKES_PER_INSTANT):
             motor.drive.wake(at_ns)
             self._ask_wake(motor)
-            if motor.wake_ns > at_ns:
+            if motor.due_ns > at_ns:
                 break
         else:
             # A drive that always wants more at one instant must not stop the others: it goes on at the next tick.
@@ -435,7 +437,9 @@ class EmulatedMachine:
             else:
                 motor.is_powered = False
                 torques[index] = 0.0
-            self._ask_wake(motor)
+            wake_ns = motor.next_wake_ns()
+            if wake_ns != motor.wake_ns:
+                self._set_wake(motor, wake_ns)
         if self.records.maxlen:
             self._record(now_ns)
         self._listen(now_ns)
@@ -531,7 +535,7 @@ class EmulatedMachine:
         self._next_tick_ns = self._start_ns + tick * TWO_SERVO_PERIODS_NS // 2
         # Wakes missed meanwhile are due once, now, not once for every period they have missed.
         for motor in self._motors:
-            motor.wake_ns = max(motor.wake_ns, self._next_tick_ns)
+            motor.due_ns = max(motor.due_ns, self._next_tick_ns)
         self._find_due()
 
     def _record(self, now_ns: int) -> None:
