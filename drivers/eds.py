@@ -3,7 +3,7 @@
 import configparser
 import io
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -48,11 +48,23 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
         EdsError: the file is missing, too large, no EDS, or contradicts itself; one sentence with the file's name.
         ValueError: ``node_id`` is not 1 to 127.
     """
-    if not 1 <= node_id <= MAX_NODE_ID:
-        raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
+    return describe_any_node(path)(node_id)
+
+
+def describe_any_node(path: Path | str) -> Callable[[int], ObjectDictionary]:
+    """Read the EDS file at ``path`` once, to make of it the object dictionary of any node id, as ``load_eds`` does.
+
+    What it gives raises as ``load_eds`` does. Raises EdsError if the file cannot be read.
+    """
     text = _read(Path(path))
     if "[DeviceInfo]" not in text:
         raise EdsError(f"{path}: not an EDS file: it has no section DeviceInfo")
+    return lambda node_id: _describe(path, text, node_id)
+
+
+def _describe(path: Path | str, text: str, node_id: int) -> ObjectDictionary:
+    if not 1 <= node_id <= MAX_NODE_ID:
+        raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
     try:
         parsed: Any = canopen.import_od(_NamedText(text), node_id)
         variables = [_convert(variable) for variable in _each_variable(parsed)]

@@ -1,18 +1,22 @@
 """Builds the emulated machine that a configuration describes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from math import inf
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
 from config.loading import SHIPPED
 from config.schema import AxisSection, GatewayConfig
-from drivers.eds import load_eds
+from drivers.eds import describe_any_node
+from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
 from sim_drive.drive import Drive
 from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.parameter_file import make_parameter_store
 from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, PlantParameters
 from sim_drive.settings import DriveIdentity, DriveSettings
+from sim_drive.switches import Switches
 
 SHIPPED_EDS: Final = SHIPPED / "eds" / "sim_drive.eds"
 FREE_AXIS: Final = FreeAxisParameters(inertia_kg_m2=0.002, viscous_N_m_s=0.005, coulomb_N_m=0.05)
@@ -31,11 +35,8 @@ def build_machine(config: GatewayConfig, seed: int = 0, start_ns: int = 0, recor
     ``record_ticks``: see EmulatedMachine. Raises drivers.errors.EdsError or mechanism.errors.MechanismError.
     """
     axes = config.ordered_axes
-    eds = config.relative(config.emulator.eds)
-    drives = [
-        Drive(axis.node_id, load_eds(eds, axis.node_id), drive_settings(axis, config), decode_cam_image)
-        for axis in axes
-    ]
+    describe = describe_any_node(config.relative(config.emulator.eds))
+    drives = [_make_drive(axis.node_id, drive_settings(axis, config), describe) for axis in axes]
     parameters = PlantParameters(
         dynamics=dynamics_parameters(config),
         closure=closure_at_home(config, desired_curve(config)),
@@ -70,13 +71,9 @@ def free_machine(
         if node_ids.count(node_id) > 1:
             raise ValueError(f"node id {node_id} is given twice, every node id must be unique")
     common = DriveSettings(gains=FREE_AXIS_GAINS) if settings is None else settings
+    describe = describe_any_node(SHIPPED_EDS)
     drives = [
-        Drive(
-            node_id,
-            load_eds(SHIPPED_EDS, node_id),
-            replace(common, identity=replace(common.identity, serial_number=node_id)),
-            decode_cam_image,
-        )
+        _make_drive(node_id, replace(common, identity=replace(common.identity, serial_number=node_id)), describe)
         for node_id in node_ids
     ]
     axis = MachineAxis(common.counts_per_revolution, rated_torque_Nm=common.rated_torque_Nm)
@@ -98,7 +95,28 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
         rated_torque_Nm=axis.rated_torque_Nm,
         gains=(gains.K_P, gains.K_I, gains.K_D, gains.K_V, gains.K_F),
         missing_set_point_limit=config.emulator.missing_sync_limit,
+        switches=switches(axis),
         quirks=axis.emulation.quirks,
+    )
+
+
+def _make_drive(node_id: int, settings: DriveSettings, describe: Callable[[int], ObjectDictionary]) -> Drive:
+    return Drive(node_id, describe(node_id), settings, decode_cam_image, make_parameter_store(settings), describe)
+
+
+def switches(axis: AxisSection) -> Switches:
+    """The switches of an axis in shaft counts, rounded to whole ones."""
+    section = axis.emulation.switches
+
+    def counts(angle_deg: float) -> int:
+        return round(angle_deg / 360.0 * axis.counts_per_revolution)
+
+    low, high, home = section.negative_limit_deg, section.positive_limit_deg, section.home_deg
+    return Switches(
+        negative_limit=-inf if low is None else counts(low),
+        positive_limit=inf if high is None else counts(high),
+        home=None if home is None else (counts(home[0]), counts(home[1])),
+        index=counts(section.index_deg),
     )
 
 

@@ -99,13 +99,25 @@ class LiveDictionary:
     __slots__ = ("_entries", "description", "refusals")
 
     def __init__(self, description: ObjectDictionary) -> None:
-        self.description: Final = description
+        self.description = description
         self._entries: Final = {(v.index, v.subindex): Entry(v) for v in description}
         self.refusals: dict[tuple[int, int | None], AbortCode] = {}
         """Objects to which an SDO client gets no access, and the code that tells him; sub-index None: all of them."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self._entries.values())
+
+    def redescribe(self, description: ObjectDictionary) -> None:
+        """Take over the defaults of the same device under another node id; those that do not depend on it stay.
+
+        The values change with the next ``restore_defaults``.
+        """
+        before = self.description
+        self.description = description
+        for variable in description:
+            old = before.get(variable.index, variable.subindex)
+            if old is not None and old.default != variable.default:
+                self._entries[variable.index, variable.subindex].default = variable.default
 
     def entry(self, index: int, subindex: int = 0) -> Entry:
         """The entry at this place; raises KeyError if the description does not have it."""

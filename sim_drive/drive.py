@@ -18,6 +18,7 @@ from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from sim_drive.lss_slave import LSS_REQUEST_COB_ID, UNCONFIGURED_NODE_ID, LssHooks, LssSlave
 from sim_drive.nmt_slave import next_state, parse_command
 from sim_drive.node_guarding import NodeGuard
 from sim_drive.parameters import MemoryParameterStore, ParameterMemory, ParametersLost, ParameterStore
@@ -30,7 +31,16 @@ from sim_drive.time_of_day import TimeConsumer, TimeOfDay
 PDO_COUNT: Final = 4
 """RPDOs and TPDOs that the drive has, each."""
 
-__all__ = ["PDO_COUNT", "Drive", "DriveIdentity", "DriveSettings", "NmtStateChanged"]
+__all__ = [
+    "PDO_COUNT",
+    "UNCONFIGURED_NODE_ID",
+    "BitTimingActivated",
+    "Drive",
+    "DriveIdentity",
+    "DriveSettings",
+    "NmtStateChanged",
+    "NodeIdChanged",
+]
 
 _NS_PER_S: Final = 1_000_000_000
 _NS_PER_US: Final = 1_000
@@ -67,8 +77,30 @@ class NmtStateChanged(Event):
     state: NmtState
 
 
+@dataclass(frozen=True, slots=True)
+class NodeIdChanged(Event):
+    """The drive has taken another node id, which LSS or its store has given it; 255 is none."""
+
+    old_node_id: int
+    node_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class BitTimingActivated(Event):
+    """The LSS master has all nodes change their bit rate; the emulated bus has none to change.
+
+    ``bit_timing`` is an index into the table of CiA 305.
+    """
+
+    node_id: int
+    bit_timing: int
+    delay_ms: int
+
+
 class Drive:
     """The core of one drive. It boots at its first ``wake``, and takes no frame before.
+
+    Without a node id (``UNCONFIGURED_NODE_ID``) it does not boot, and takes LSS frames alone.
 
     ``outbox`` and ``events`` are lists that a host may also empty in place; they are never replaced.
     """
@@ -80,19 +112,24 @@ class Drive:
         settings: DriveSettings,
         decode_cam: CamDecoder,
         store: ParameterStore | None = None,
+        describe: Callable[[int], ObjectDictionary] | None = None,
     ) -> None:
         """Make a drive that is switched off; ``dictionary`` is what ``load_eds`` gives for this node id.
 
         ``store`` is its non-volatile memory (see ``parameter_file.make_parameter_store``); None: one of its own, which
-        is lost with the drive.
+        is lost with the drive. ``describe`` gives the dictionary for any node id (``drivers.eds.describe_any_node``);
+        without it LSS cannot give the drive another one. What is stored for LSS goes before ``node_id``.
 
         Raises:
-            ValueError: ``node_id`` is not 1 to 127, or ``settings.gains`` are not five.
+            ValueError: ``node_id`` is neither 1 to 127 nor, with ``describe``, 255, or ``settings.gains`` are not five.
             KeyError: the dictionary lacks an object that the drive needs.
         """
-        if not 1 <= node_id <= MAX_NODE_ID:
+        if not 1 <= node_id <= MAX_NODE_ID and (node_id != UNCONFIGURED_NODE_ID or describe is None):
             raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
-        self.node_id: Final = node_id
+        self.node_id = node_id
+        """It changes at a reset, if LSS has given another one."""
+        self._made_node_id: Final = node_id
+        self._describe: Final = describe
         self.settings: Final = settings
         self.outbox: list[Frame] = []
         self.events: list[Event] = []
@@ -136,6 +173,8 @@ class Drive:
         """The last SYNC, noted while there is a synchronous window; None before the first."""
         self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
         self._memory = ParameterMemory(self.dictionary, store or MemoryParameterStore(), self._on_parameters_saved)
+        hooks = LssHooks(self._memory.save_layer_settings, self._on_lss_waiting, self._on_bit_timing)
+        self._lss = LssSlave(node_id, self.dictionary, self.outbox, hooks, can_change=describe is not None)
         if self._memory.stored.values:
             self._memory.apply(objects.DEVICE_TYPE, _LAST_INDEX)
             self.axis.restore()
@@ -188,9 +227,12 @@ class Drive:
             if not self._is_powered_on:
                 self._is_powered_on = True
                 self._boot_due_ns = now_ns + round(self.settings.boot_up_delay_s * _NS_PER_S)
+                self._take_node_id(self._persistent_node_id, now_ns)
             if now_ns < self._boot_due_ns:
                 return
             self._boot_up(now_ns)
+        if self.node_id == UNCONFIGURED_NODE_ID:
+            return
         self._consumer.wake(now_ns)
         self._guard.wake(now_ns)
         self._emergency.wake(now_ns)
@@ -222,6 +264,8 @@ class Drive:
             return None
         if self._boot_due_ns is not None:
             return self._boot_due_ns
+        if self.node_id == UNCONFIGURED_NODE_ID:
+            return None
         timers = (self._consumer, self._guard, self._emergency, self._sdo, self._producer)
         dues = [timer.next_wake_ns() for timer in timers]
         if self.nmt_state is NmtState.OPERATIONAL:
@@ -366,6 +410,7 @@ class Drive:
             self.axis.lose_connection(EmergencyCode.COMMUNICATION, ErrorRegister.COMMUNICATION, now_ns)
 
     def _reset(self, is_whole_node: bool, now_ns: int) -> None:
+        self._take_node_id(self._persistent_node_id if is_whole_node else self._lss.pending_node_id, now_ns)
         last_index = _LAST_INDEX if is_whole_node else _LAST_COMMUNICATION_INDEX
         self.dictionary.restore_defaults(objects.DEVICE_TYPE, last_index)
         self._memory.apply(objects.DEVICE_TYPE, last_index)
@@ -390,6 +435,10 @@ class Drive:
 
     def _boot_up(self, now_ns: int) -> None:
         self._boot_due_ns = None
+        if self.node_id == UNCONFIGURED_NODE_ID:
+            self._handlers = {LSS_REQUEST_COB_ID: self._on_lss}
+            self.subscriptions_changed = True
+            return
         for pdo in (*self._rpdos, *self._tpdos):
             pdo.restore(now_ns)
         self._producer.restore(now_ns)
@@ -404,6 +453,26 @@ class Drive:
         self._enter(NmtState.PRE_OPERATIONAL, now_ns)
         if self._memory.damage is not None:
             self._tell_loss(self._memory.damage, now_ns)
+
+    @property
+    def _persistent_node_id(self) -> int:
+        stored = self._memory.stored.node_id
+        return self._made_node_id if stored is None or self._describe is None else stored
+
+    def _take_node_id(self, node_id: int, now_ns: int) -> None:
+        """Become another node, with the communication parameters that it has by default or from the store."""
+        self._lss.restart(node_id)
+        if node_id == self.node_id:
+            return
+        self.events.append(NodeIdChanged(now_ns, self.node_id, node_id))
+        self.node_id = node_id
+        if self._describe is not None and node_id != UNCONFIGURED_NODE_ID:
+            self.dictionary.redescribe(self._describe(node_id))
+            self.dictionary.restore_defaults(objects.DEVICE_TYPE, _LAST_COMMUNICATION_INDEX)
+            self._memory.apply(objects.DEVICE_TYPE, _LAST_COMMUNICATION_INDEX)
+        for service in (self._emergency, self._sdo, self._producer, self._guard):
+            service.set_node_id(node_id)
+        setattr(self.axis, "_node_id", node_id)  # noqa: B010 - for its events alone
 
     def _tell_loss(self, reason: str, now_ns: int) -> None:
         if not self._emergency.is_active(EmergencyCode.PARAMETERS_LOST):
@@ -459,6 +528,7 @@ class Drive:
         _add(handlers, self._sync_cob_id.value & COB_ID_MASK, self._on_sync if is_plain else self._on_noted_sync)
         if self._time.cob_id is not None:
             _add(handlers, self._time.cob_id, self._on_time)
+        _add(handlers, LSS_REQUEST_COB_ID, self._on_lss)
         _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
         _add(handlers, NMT_COB_ID, self._on_nmt)
         self._handlers = handlers
@@ -550,6 +620,18 @@ class Drive:
     def _on_time(self, data: bytes, now_ns: int) -> None:
         if self.nmt_state is not NmtState.STOPPED:
             self._time.receive(data, now_ns)
+
+    def _on_lss(self, data: bytes, now_ns: int) -> None:
+        self._is_wake_stale = True
+        self._lss.receive(data, now_ns)
+
+    def _on_lss_waiting(self, now_ns: int) -> None:
+        """A node that had no node id, and has been given one, boots."""
+        if self.node_id == UNCONFIGURED_NODE_ID != self._lss.pending_node_id:
+            self._reset(False, now_ns)
+
+    def _on_bit_timing(self, bit_timing: int, delay_ms: int, now_ns: int) -> None:
+        self.events.append(BitTimingActivated(now_ns, self.node_id, bit_timing, delay_ms))
 
     def _expect_wake(self) -> None:
         self._is_wake_stale = True

@@ -139,6 +139,10 @@ class EmergencyProducer:
             self._outbox.append(self._held_back.popleft())
             self._free_at_ns = now_ns + self._inhibit_time.value * _INHIBIT_UNIT_NS
 
+    def set_node_id(self, node_id: int) -> None:
+        """Events tell another node id from now on; the COB-ID is 1014h's."""
+        self._node_id = node_id
+
     @property
     def has_persisting_fault(self) -> bool:
         """Whether the cause of an error is still there, so that a fault reset has to be refused."""

@@ -25,6 +25,10 @@ class HeartbeatProducer:
         self._time = dictionary.entry(PRODUCER_HEARTBEAT_TIME)
         self._time.on_write = self._on_time
 
+    def set_node_id(self, node_id: int) -> None:
+        """Send under another node id from now on."""
+        self._cob_id = HEARTBEAT_BASE + node_id
+
     def restore(self, now_ns: int) -> None:
         """Begin anew with the period that 1017h holds."""
         self._on_time(self._time.value, now_ns)

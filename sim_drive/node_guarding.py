@@ -52,6 +52,10 @@ class NodeGuard:
         self.is_lost = False
         """The master's requests have stayed away, and have not come again."""
 
+    def set_node_id(self, node_id: int) -> None:
+        """Answer under another node id from now on."""
+        self._cob_id = HEARTBEAT_BASE + node_id
+
     @property
     def _life_time_ns(self) -> int:
         return self._guard_time.value * self._factor.value * _NS_PER_MS

@@ -26,7 +26,7 @@ class _Body(BaseModel):
 
     format: Literal["sim-drive parameters"] = "sim-drive parameters"
     version: Literal[1] = 1
-    node_id: Annotated[int, Field(ge=1, le=127)] | None = None
+    node_id: Annotated[int, Field(ge=1, le=127)] | Literal[255] | None = None
     bit_timing: Annotated[int, Field(ge=0, le=9)] | None = None
     values: dict[
         Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{2}$")],

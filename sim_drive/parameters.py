@@ -59,7 +59,7 @@ class StoredParameters:
     values: Mapping[Place, bytes] = field(default_factory=dict[Place, bytes])
     """Little-endian bytes, as SDO carries them."""
     node_id: int | None = None
-    """Stored by LSS; None: the one that the drive is made with."""
+    """Stored by LSS, 1 to 127, or 255 for none at all; None: the one that the drive is made with."""
     bit_timing: int | None = None
     """Index into the bit timing table of CiA 305, stored by LSS."""
 
@@ -145,7 +145,7 @@ class ParameterMemory:
                 entry = self._dictionary.entry(*place)
                 entry.value = decode(entry.data_type, data)
 
-    def save_layer_settings(self, node_id: int | None, bit_timing: int | None, now_ns: int) -> bool:
+    def save_layer_settings(self, node_id: int, bit_timing: int | None, now_ns: int) -> bool:
         """Store what LSS has configured; whether it has worked."""
         return self._save(replace(self.stored, node_id=node_id, bit_timing=bit_timing), now_ns)
 

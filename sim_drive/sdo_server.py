@@ -91,6 +91,11 @@ class SdoServer:
         self._index = 0
         self._subindex = 0
 
+    def set_node_id(self, node_id: int) -> None:
+        """Serve under another node id; a transfer under way is forgotten."""
+        self._cob_id = SDO_RESPONSE_BASE + node_id
+        self.reset()
+
     @property
     def is_busy(self) -> bool:
         """Whether a transfer is under way that takes more than one request."""

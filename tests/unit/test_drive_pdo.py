@@ -115,20 +115,20 @@ def test_types_on_remote_request_are_for_tpdos_alone(bench: Bench):
 
 def test_subscriptions_follow_the_configuration(bench: Bench):
     drive = bench.drive
-    # NMT, SYNC, TIME, RPDO 1, SDO, guard requests
-    assert drive.cob_ids() == {0x000, 0x080, 0x100, 0x205, 0x605, 0x705}
+    usual = {0x000, 0x100, 0x205, 0x605, 0x705, 0x7E5}  # NMT, TIME, RPDO 1, SDO, guard requests, LSS
+    assert drive.cob_ids() == usual | {0x080}
     drive.subscriptions_changed = False
     bench.map_rpdo(2, 0x181, 1, [0x00060010, 0x30110020])
     assert drive.subscriptions_changed
-    assert drive.cob_ids() == {0x000, 0x080, 0x100, 0x205, 0x605, 0x705, 0x181}
+    assert drive.cob_ids() == usual | {0x080, 0x181}
     bench.must(0x1005, 0, 0x90, 4)
     bench.must(0x1016, 2, 0x030064, 4)
     bench.must(0x1012, 0, 0x00000100, 4)
-    assert drive.cob_ids() == {0x000, 0x090, 0x205, 0x605, 0x705, 0x181, 0x703}
+    assert drive.cob_ids() == usual - {0x100} | {0x090, 0x181, 0x703}
     drive.subscriptions_changed = False
     bench.nmt(0x82)
     assert drive.subscriptions_changed
-    assert drive.cob_ids() == {0x000, 0x080, 0x100, 0x205, 0x605, 0x705}
+    assert drive.cob_ids() == usual | {0x080}
 
 
 @pytest.mark.parametrize("value", [0x40000080, 0x20000080, 0x0, 0x7F, 0x101, 0x600 + 5, 0x701])
