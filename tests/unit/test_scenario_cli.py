@@ -129,20 +129,9 @@ def test_an_unknown_quirk_on_the_command_line_is_wrong_use() -> None:
 @pytest.mark.parametrize("fleet", [("--nodes", "1-2"), ("paper",)])
 def test_a_quirk_of_the_command_line_is_on_the_bus(fleet: tuple[str, ...]) -> None:
     """Reset node: with a short boot-up, 701h and 702h have no data."""
-    command = [
-        *COMMAND,
-        *fleet,
-        "--quirk",
-        Quirk.SHORT_BOOT_UP.value,
-        "--interface",
-        "socketcand",
-        "--port",
-        "0",
-        "--json",
-    ]
-    with subprocess.Popen(
-        [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
+    options = ("--quirk", Quirk.SHORT_BOOT_UP.value, "--interface", "socketcand", "--port", "0", "--json")
+    command = [*COMMAND, *fleet, *options]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
         try:
             assert process.stdout is not None
             place = json.loads(process.stdout.readline())
