@@ -123,6 +123,28 @@ class GainsSection(Model):
     K_F: Annotated[int, Field(ge=0, le=1_000_000)] = 0
 
 
+class SwitchesSection(Model):
+    """Switches and index pulse of an emulated axis, by the angle of its link as the plant has it."""
+
+    negative_limit_deg: float | None = None
+    """On at and below; null for a switch that is not fitted."""
+    positive_limit_deg: float | None = None
+    """On at and above."""
+    home_deg: tuple[float, float] | None = None
+    """On from the first angle to the second."""
+    index_deg: float = 0.0
+    """The encoder's index pulse, once a revolution."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.negative_limit_deg, self.positive_limit_deg
+        if low is not None and high is not None and low >= high:
+            raise ValueError(f"negative_limit_deg: {low:g} is not below positive_limit_deg: {high:g}")
+        if self.home_deg is not None and self.home_deg[0] >= self.home_deg[1]:
+            raise ValueError(f"home_deg: {self.home_deg[0]:g} is not below {self.home_deg[1]:g}")
+        return self
+
+
 class EmulatedDriveSection(Model):
     """Motor and amplifier of the emulated drive; a gateway against real drives does not read it."""
 
@@ -135,6 +157,7 @@ class EmulatedDriveSection(Model):
     viscous_Nms: NotNegative = 0.0
     brake_torque_Nm: NotNegative
     resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    switches: SwitchesSection = SwitchesSection()
     quirks: frozenset[Quirk] = frozenset()
     """Habits of real drives that the emulated one is to have."""
 

@@ -86,6 +86,7 @@ class Axis(Motion):
         "_active",
         "_after_ramp",
         "_coming_mode",
+        "_digital_inputs",
         "_emergency",
         "_enabled_bits",
         "_events",
@@ -94,6 +95,7 @@ class Axis(Motion):
         "_following_error_timeout",
         "_following_error_window",
         "_gain_entries",
+        "_has_switches",
         "_homing",
         "_idle_controlword",
         "_interpolation_exponent",
@@ -144,6 +146,8 @@ class Axis(Motion):
         self._velocity_actual = entry(objects.VELOCITY_ACTUAL_VALUE)
         self._torque_actual = entry(objects.TORQUE_ACTUAL_VALUE)
         self._following_error = entry(objects.FOLLOWING_ERROR_ACTUAL_VALUE)
+        self._digital_inputs = entry(objects.DIGITAL_INPUTS)
+        self._digital_inputs.on_read = self._read_inputs
         self._following_error_window = entry(objects.FOLLOWING_ERROR_WINDOW)
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
@@ -151,6 +155,7 @@ class Axis(Motion):
         self._max_torque = entry(objects.MAX_TORQUE)
         self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
         self._rated_torque_Nm = settings.rated_torque_Nm
+        self._has_switches = bool(settings.switches.fitted)
         self._set_defaults()
         self._set_hooks()
 
@@ -380,7 +385,12 @@ class Axis(Motion):
         self._following_error.value = error if -_HALF < error < _HALF else _clamp(error, _HALF - 1)
         rate = floor(velocity + 0.5)
         self._velocity_actual.value = rate if -_HALF < rate < _HALF else _clamp(rate, _HALF - 1)
+        if self._has_switches:
+            self._digital_inputs.value = self.settings.switches.inputs(position)
         self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
+
+    def _read_inputs(self, now_ns: int) -> int:
+        return self.settings.switches.inputs(self.latch(now_ns)[0])
 
     def forget_sample(self) -> None:
         """The frames of counts have moved: what has been sampled for this instant no longer holds."""

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from config.quirks import Quirk
+from sim_drive.switches import Switches
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,7 @@ class DriveSettings:
     rated_torque_Nm: float = 1.5
     gains: tuple[int, ...] | None = None
     """Defaults of 3020h (K_P, K_I, K_D, K_V, K_F over 256); None keeps those of the EDS file."""
+    switches: Switches = field(default_factory=Switches)
     initial_offset_counts: int = 0
     """Position actual value minus shaft counts after power-on, before any homing."""
     missing_set_point_limit: int = 5

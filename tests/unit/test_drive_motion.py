@@ -363,7 +363,7 @@ def test_homing_method_none_attains_without_moving_the_zero():
     bench.tick()
     assert bench.statusword & 0x3400 == 0x1400
     assert bench.read(0x6064) == 50
-    assert bench.write(0x6098, 0, 1, 1) == 0x06090030
+    assert bench.write(0x6098, 0, 15, 1) == 0x06090030
 
 
 def test_homing_then_csp_in_the_new_frame_does_not_jump():
