@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
-from math import inf
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
@@ -17,7 +16,6 @@ from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.parameter_file import make_parameter_store
 from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, PlantParameters
 from sim_drive.settings import DriveIdentity, DriveSettings
-from sim_drive.switches import Switches
 from sim_drive.switches import Switches
 
 SHIPPED_EDS: Final = SHIPPED / "eds" / "sim_drive.eds"
@@ -98,29 +96,12 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
         gains=(gains.K_P, gains.K_I, gains.K_D, gains.K_V, gains.K_F),
         missing_set_point_limit=config.emulator.missing_sync_limit,
         switches=switches(axis),
-        switches=switches(axis),
         quirks=axis.emulation.quirks,
     )
 
 
 def _make_drive(node_id: int, settings: DriveSettings, describe: Callable[[int], ObjectDictionary]) -> Drive:
     return Drive(node_id, describe(node_id), settings, decode_cam_image, make_parameter_store(settings), describe)
-
-
-def switches(axis: AxisSection) -> Switches:
-    """The switches of an axis in shaft counts, rounded to whole ones."""
-    section = axis.emulation.switches
-
-    def counts(angle_deg: float) -> int:
-        return round(angle_deg / 360.0 * axis.counts_per_revolution)
-
-    low, high, home = section.negative_limit_deg, section.positive_limit_deg, section.home_deg
-    return Switches(
-        negative_limit=-inf if low is None else counts(low),
-        positive_limit=inf if high is None else counts(high),
-        home=None if home is None else (counts(home[0]), counts(home[1])),
-        index=counts(section.index_deg),
-    )
 
 
 def switches(axis: AxisSection) -> Switches:
