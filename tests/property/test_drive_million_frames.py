@@ -20,7 +20,7 @@ from sim_drive.assembly import SHIPPED_EDS, build_machine, free_machine
 from sim_drive.cia402 import PowerStateChanged
 
 NODES = (1, 2)
-ROUND = 1000
+ROUND = 500
 """Frames after which the drives are looked after, so that none stays stopped or without a node id for long."""
 
 MASKS = {
@@ -60,6 +60,26 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
     ]
 
 
+SCRIPTS = [
+    # Requests that belong together: block download and upload, segmented download and upload, a cam slot's commands.
+    ("C600300109000000", "0131323334353637", "8238390000000000", "D5C3310000000000"),
+    ("A40030017F000000", "A300000000000000", "A2027F0000000000", "A100000000000000"),
+    ("A400300101000000", "A300000000000000", "A201010000000000", "A201010000000000", "A100000000000000"),
+    ("2100300109000000", "0031323334353637", "1B38390000000000", "2F00300201000000"),
+    ("4000300100000000", "6000000000000000", "7000000000000000"),
+    ("4008100000000000", "6000000000000000", "7000000000000000"),
+    # Profile position, homing, profile velocity, halt and on again, quick stop and on again.
+    ("2F60600001000000", "237A6000E8030000", "2B4060000F000000", "2B4060001F000000", "2B4060000F000000"),
+    ("2F60600006000000", "2B4060000F000000", "2B4060001F000000"),
+    ("2F60600003000000", "23FF600010270000", "2B4060000F010000", "2B4060000F000000"),
+    ("2B5A600006000000", "2B40600002000000", "2B4060000F000000"),
+    # Heartbeats, and an event-driven TPDO with inhibit and event timers.
+    ("2316100132007F00", "2B17100032000000"),
+    ("2300180181010080", "2F001802FF000000", "2B00180332000000", "2B0018050A000000", "2300180181010000"),
+]
+"""Each with the requests of a service in their order, which chance alone would hardly find."""
+
+
 class Source:
     """Frames without end."""
 
@@ -67,6 +87,13 @@ class Source:
         self.random = random.Random(seed)
         self.recorded = recorded
         self.place = 0
+        self.queue: deque[Frame] = deque()
+        self.is_calm = False
+        """Mostly what a master and its drives say to one another at every SYNC, so that its state lasts."""
+        first_sync = next(place for place, frame in enumerate(recorded) if frame.cob_id == 0x080)
+        self.commissioning = [
+            frame for frame in recorded[: first_sync + 40] if frame.cob_id == 0 or 0x580 < frame.cob_id <= 0x67F
+        ]
         objects = [variable for variable in load_eds(SHIPPED_EDS, 1) if variable.index >= 0x1000]
         self.places = [(variable.index, variable.subindex) for variable in objects]
         self.writable = [
@@ -76,6 +103,7 @@ class Source:
         ]
         self.kinds = (
             [self.play] * 20
+            + [self.script] * 10
             + [self.mutant] * 16
             + [self.write] * 16
             + [self.read] * 8
@@ -93,7 +121,18 @@ class Source:
         )
 
     def __next__(self) -> Frame:
+        if self.is_calm and self.random.random() < 0.95:
+            return self.random.choice([self.play, self.play, self.play, self.sync, self.pdo])()
+        if self.queue and self.random.random() < 0.8:
+            return self.queue.popleft()
         return self.random.choice(self.kinds)()
+
+    def script(self) -> Frame:
+        """Begin with requests that belong together; others come in between."""
+        cob_id = 0x600 + self.node()
+        requests = [Frame(cob_id, bytes.fromhex(text)) for text in self.random.choice(SCRIPTS)]
+        self.queue.extend(requests[1:])
+        return requests[0]
 
     def node(self) -> int:
         return self.random.choice(NODES)
@@ -329,6 +368,11 @@ class Watch:
                 self.put(Frame(0x600 + node, bytes.fromhex("231110016C6F6164")))  # restore defaults
             self.put(Frame(0x000, b"\x81\x00"))
             self.pass_time(3_000_000)
+        self.source.is_calm = pick < 0.15
+        if pick < 0.15:
+            for frame in self.source.commissioning:
+                self.put(frame)
+                self.pass_time(300_000)
         if pick < 0.8:
             self.put(Frame(0x000, b"\x01\x00"))
             for node in NODES:
