@@ -13,6 +13,7 @@ from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
 from sim_drive.drive import Drive
 from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.node_row import describe_row
 from sim_drive.parameter_file import make_parameter_store
 from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, PlantParameters
 from sim_drive.settings import DriveIdentity, DriveSettings
@@ -23,6 +24,8 @@ FREE_AXIS: Final = FreeAxisParameters(inertia_kg_m2=0.002, viscous_N_m_s=0.005, 
 """What a drive of ``free_machine`` moves."""
 FREE_AXIS_GAINS: Final = (4000, 0, 0, 45_000, 45_000)
 """3020h of a drive of ``free_machine``: the paper's, which suit the inertia."""
+
+_FEW_NODES: Final = 3
 
 SINGULAR_SHARE: Final = 0.5
 """The plant tears at this share of the transmission sine that the configuration keeps as its distance."""
@@ -59,8 +62,8 @@ def free_machine(
 ) -> EmulatedMachine:
     """Drives without a configuration, each on an axis of its own that is coupled to nothing, at 0 rad, brake engaged.
 
-    ``settings``: of every drive, save that each has its node id for a serial number; by default those of the EDS file
-    that ships, with gains that suit the axis. ``start_ns``, ``seed``, ``record_ticks``: see EmulatedMachine. Several
+    ``settings``: of every drive, save that each has its node id for a serial number, and in the name of a parameter
+    file; by default those of the EDS file that ships, with gains that suit the axis. ``start_ns``, ``seed``, ``record_ticks``: see EmulatedMachine. Several
     machines may share a bus, if all node ids on it differ.
 
     Raises ValueError if a node id is not 1 to 127, or is given twice, or there is none.
@@ -72,13 +75,21 @@ def free_machine(
             raise ValueError(f"node id {node_id} is given twice, every node id must be unique")
     common = DriveSettings(gains=FREE_AXIS_GAINS) if settings is None else settings
     describe = describe_any_node(SHIPPED_EDS)
-    drives = [
-        _make_drive(node_id, replace(common, identity=replace(common.identity, serial_number=node_id)), describe)
-        for node_id in node_ids
-    ]
+    if len(node_ids) > _FEW_NODES:
+        describe = describe_row(describe)
+    drives = [_make_drive(node_id, _settings_in_row(common, node_id), describe) for node_id in node_ids]
     axis = MachineAxis(common.counts_per_revolution, rated_torque_Nm=common.rated_torque_Nm)
     plant = FreeAxisPlant([FREE_AXIS] * len(drives), [0.0] * len(drives))
     return EmulatedMachine(drives, plant, [axis] * len(drives), start_ns, seed, record_ticks)
+
+
+def _settings_in_row(common: DriveSettings, node_id: int) -> DriveSettings:
+    file = common.parameter_file
+    return replace(
+        common,
+        identity=replace(common.identity, serial_number=node_id),
+        parameter_file=None if file is None else file.with_stem(f"{file.stem}-{node_id}"),
+    )
 
 
 def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
