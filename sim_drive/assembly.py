@@ -63,8 +63,8 @@ def free_machine(
     """Drives without a configuration, each on an axis of its own that is coupled to nothing, at 0 rad, brake engaged.
 
     ``settings``: of every drive, save that each has its node id for a serial number, and in the name of a parameter
-    file; by default those of the EDS file that ships, with gains that suit the axis. ``start_ns``, ``seed``, ``record_ticks``: see EmulatedMachine. Several
-    machines may share a bus, if all node ids on it differ.
+    file; by default those of the EDS file that ships, with gains that suit the axis. ``start_ns``, ``seed``,
+    ``record_ticks``: see EmulatedMachine. Several machines may share a bus, if all node ids on it differ.
 
     Raises ValueError if a node id is not 1 to 127, or is given twice, or there is none.
     """

@@ -1,5 +1,7 @@
 """Any number of drives in one process: a whole bus of them, and several machines on one."""
 
+from pathlib import Path
+
 import pytest
 
 from config.loading import load_config
@@ -77,6 +79,12 @@ def test_settings_are_of_every_drive() -> None:
         assert drive.gains == (1, 2, 3, 4, 5)
         assert drive.dictionary.read(0x608F, 1, 0) == bytes((0, 0, 1, 0))
     assert [axis.counts_per_revolution for axis in machine.axes] == [65536, 65536]
+
+
+def test_every_drive_has_a_parameter_file_of_its_own(tmp_path: Path) -> None:
+    machine = free_machine([3, 4], settings=DriveSettings(parameter_file=tmp_path / "row.json"))
+    files = [drive.settings.parameter_file for drive in machine.drives if isinstance(drive, Drive)]
+    assert files == [tmp_path / "row-3.json", tmp_path / "row-4.json"]
 
 
 @pytest.mark.parametrize(
