@@ -28,6 +28,7 @@ from mechanism.errors import CamFileError
 from mechanism.five_bar import Closure, FiveBar
 
 REPORT_VERSION: Final = 1
+_POSITION_RANGE: Final = 2.0**32
 FOLLOWING_PHASES: Final = (Phase.RAMP_UP, Phase.CAM, Phase.RAMP_DOWN, Phase.CONTROLLED_STOP)
 """In these the axes follow the cam, so that a following error means something."""
 SMOOTHING_CYCLES: Final = 10
@@ -198,6 +199,9 @@ class RunData:
     master_deg: FloatArray
     """theta2 demanded, 0 to 360."""
     is_valid: BoolArray
+    demand_counts: FloatArray
+    actual_counts: FloatArray
+    """Positions without the wrap of INTEGER32."""
     error_counts: FloatArray
     error_deg: FloatArray
     torque_nm: FloatArray
@@ -224,11 +228,12 @@ def prepare(samples: SampleArray, constants: RunConstants, cam: CamProfile | Non
     """
     counts_per_revolution = np.array([axis.counts_per_revolution for axis in constants.axes], dtype=np.float64)
     rated = np.array([axis.rated_torque_nm for axis in constants.axes])
-    demand = samples["position_demand"].astype(np.float64)
-    actual = samples["position_actual"].astype(np.float64)
+    # Positions are INTEGER32 and wrap: the difference is taken modulo 2^32, and the demand made continuous.
+    error = (samples["position_demand"] - samples["position_actual"]).astype(np.float64)
+    demand = np.unwrap(samples["position_demand"].astype(np.float64), axis=0, period=_POSITION_RANGE)
+    actual = demand - error
     axis_bits = 1 << np.arange(len(constants.axes))
     is_valid: BoolArray = (samples["flags"][:, None] & axis_bits) == 0
-    error = demand - actual
     master = samples["master_position"].astype(np.float64)
     angle = _angles(actual, constants)
     desired_mm = actual_mm = None
@@ -253,6 +258,8 @@ def prepare(samples: SampleArray, constants: RunConstants, cam: CamProfile | Non
         master_rad=master,
         master_deg=np.degrees(np.mod(master, math.tau)),
         is_valid=is_valid,
+        demand_counts=demand,
+        actual_counts=actual,
         error_counts=error,
         error_deg=error * 360.0 / counts_per_revolution,
         torque_nm=samples["torque_actual"] * rated / 1000.0,
@@ -311,10 +318,10 @@ def phase_figures(data: RunData, mask: BoolArray) -> PhaseFigures:
 
 def _axis_figures(data: RunData, axis: int, mask: BoolArray) -> AxisFigures:
     valid = mask & data.is_valid[:, axis]
-    position = data.samples["position_actual"][valid, axis].astype(np.float64)
+    position = data.actual_counts[valid, axis]
     torque = data.torque_nm[valid, axis]
     constants = data.constants.axes[axis]
-    demand = data.samples["position_demand"][mask, axis].astype(np.float64)
+    demand = data.demand_counts[mask, axis]
     degrees = 360.0 / constants.counts_per_revolution
     return AxisFigures(
         samples=len(position),
@@ -336,7 +343,7 @@ def _velocity(data: RunData, axis: int, valid: BoolArray, span: int) -> tuple[ND
     Only spans whose ends are valid and exactly ``span`` cycles apart.
     """
     cycle = data.samples["cycle"]
-    position = data.samples["position_actual"][:, axis].astype(np.float64)
+    position = data.actual_counts[:, axis]
     if len(cycle) <= span:
         return np.empty(0, dtype=np.intp), np.empty(0)
     usable = valid[span:] & valid[:-span] & (cycle[span:] - cycle[:-span] == span)

@@ -25,6 +25,8 @@ from gateway.errors import CommissioningError
 
 DEVICE_PROFILE_402: Final = 0x0192
 """Low word of 1000h of every CiA 402 drive."""
+ABORT_CONNECTION_FAULT: Final = 1
+"""6007h: a drive that loses the gateway goes into a fault, and so stops."""
 PDO_COUNT: Final = 4
 U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
@@ -120,21 +122,24 @@ def check_identity(master: Master, node: NodeSettings) -> Procedure[None]:
 
 
 def write_parameters(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
-    """Write what the cycle relies on, and check the scales that the drive itself has."""
+    """Write what the cycle relies on, and check the scales that the drive itself has, where it tells them."""
     node_id = node.node_id
     value, exponent = network.interpolation_time
     yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 1, U8, value)
     yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 2, I8, exponent)
     yield from _write_if_there(master, node_id, objects.COMMUNICATION_CYCLE_PERIOD, U32, network.cycle_us)
     yield from master.write(node_id, objects.FOLLOWING_ERROR_WINDOW, 0, U32, node.following_error_window)
-    rated = yield from master.read_int(node_id, objects.MOTOR_RATED_TORQUE, 0, U32)
-    increments = yield from master.read_int(node_id, objects.POSITION_ENCODER_RESOLUTION, 1, U32)
-    revolutions = yield from master.read_int(node_id, objects.POSITION_ENCODER_RESOLUTION, 2, U32)
+    yield from _write_if_there(master, node_id, objects.ABORT_CONNECTION_OPTION_CODE, I16, ABORT_CONNECTION_FAULT)
+    rated = yield from _read_if_there(master, node_id, objects.MOTOR_RATED_TORQUE, 0)
+    increments = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 1)
+    revolutions = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 2)
     problems: list[str] = []
-    if rated != node.rated_torque_mNm:
+    if rated is not None and rated != node.rated_torque_mNm:
         problems.append(
             f"node {node_id} has a rated torque of {rated} mN m (6076h), the configuration says {node.rated_torque_mNm}"
         )
+    if increments is None or revolutions is None:
+        increments, revolutions = node.counts_per_revolution, 1
     if revolutions == 0 or increments != node.counts_per_revolution * revolutions:
         problems.append(
             f"node {node_id} has {increments} increments in {revolutions} revolutions (608Fh), "
@@ -142,6 +147,16 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
         )
     if problems:
         raise CommissioningError(problems)
+
+
+def _read_if_there(master: Master, node_id: int, index: int, subindex: int) -> Procedure[int | None]:
+    """Read an UNSIGNED32 that the standard leaves optional; None from a drive that does not have it."""
+    try:
+        return (yield from master.read_int(node_id, index, subindex, U32))
+    except SdoAbortedError as error:
+        if error.code not in {AbortCode.OBJECT_DOES_NOT_EXIST, AbortCode.SUBINDEX_DOES_NOT_EXIST}:
+            raise
+        return None
 
 
 def _write_if_there(master: Master, node_id: int, index: int, data_type: DataType, value: Value) -> Procedure[None]:

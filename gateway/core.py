@@ -3,18 +3,18 @@
 It implements ``drivers.node.Node``; the virtual-time and the real-time host drive the same object.
 """
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from drivers import cia402, objects
-from drivers.cia402 import ModeOfOperation, State, Statusword, state_of
-from drivers.errors import DriveError, NoAnswerError, NodeError
+from drivers import cia402
+from drivers.cia402 import ModeOfOperation, State, state_of
+from drivers.errors import DriveError, NodeError
 from drivers.frame import Frame
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, Master, NodeStateChanged, Procedure
 from drivers.nmt import NmtCommand, NmtState
 from drivers.node import Event
-from drivers.object_dictionary import DataType
 from gateway.commissioning import (
     NetworkSettings,
     NodeSettings,
@@ -23,10 +23,11 @@ from gateway.commissioning import (
     release_heartbeat,
     start_nodes,
 )
-from gateway.cycle import AxisChannel, CyclicLoop
+from gateway.cycle import CyclicLoop
 from gateway.demand import CamDemand
 from gateway.errors import CommissioningError, GatewayError
 from gateway.guard import Condition, Guard, StopReason
+from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.sample import Phase
 from mechanism.motion import MasterPlan
 
@@ -35,17 +36,12 @@ SETTLE_S: Final = 0.1
 """Standstill under guard before the motion begins, and after it before the drives are disabled."""
 WATCH_AFTER_DISABLING_S: Final = 0.02
 """For so long the cycle goes on after the drives are disabled, to see and record that they stay where they are."""
-START_CYCLES: Final = 4
-"""Cycles after which a drive shows what it makes of a controlword: sent, applied at SYNC, sampled, returned."""
-ENABLE_TIMEOUT_S: Final = 2.0
-HOMING_TIMEOUT_S: Final = 5.0
-MODE_TIMEOUT_S: Final = 1.0
 STANDSTILL_TIMEOUT_S: Final = 3.0
-DISABLE_TIMEOUT_S: Final = 0.5
-START_WINDOW_COUNTS: Final = 20
+START_WINDOW_RAD: Final = math.radians(1.75)
 """How far from the cam's start an axis may stand; more is a linkage that would jump."""
+STANDSTILL_RAD: Final = math.radians(0.18)
 STANDSTILL_COUNTS: Final = 2
-"""An axis that has moved no more than this in ``STANDSTILL_SPAN_S`` stands."""
+"""An axis that has moved no more than the larger of these in ``STANDSTILL_SPAN_S`` stands."""
 STANDSTILL_SPAN_S: Final = 0.05
 
 
@@ -54,15 +50,6 @@ class StepReached(Event):
     """A named step of the session begins."""
 
     step: str
-
-
-@dataclass(frozen=True, slots=True)
-class AxisSetup:
-    """One axis of a session: the drive, how it is homed, and the channel that the cycle uses."""
-
-    node: NodeSettings
-    channel: AxisChannel
-    homing_method: int | None
 
 
 class OperatorStopError(GatewayError):
@@ -98,9 +85,13 @@ class GatewayCore:
         self._guard = guard
         self._is_homing_again = is_homing_again
         self._is_stop_requested = False
+        self._is_watching_nodes = False
+        """Set once the drives are configured: one that restarts or falls silent after that is not what it was."""
+        self._lost: list[str] = []
         self._is_interruptible = True
         """Before anything is in motion a stop request ends the session where it is."""
         self._events: list[Event] = []
+        self.power = AxisPower(master, loop)
         self._axis_of_node = {axis.node.node_id: number for number, axis in enumerate(axes)}
         self._session: Procedure[None] | None = None
         self._resume_at_ns: int | None = 0
@@ -169,7 +160,7 @@ class GatewayCore:
     def request_quick_stop(self) -> None:
         """Quick stop on all drives."""
         self._is_stop_requested = True
-        if self.loop.is_running and self.loop.phase is not Phase.QUICK_STOP:
+        if self.loop.is_running:
             self.loop.quick_stop()
 
     # -- inside --------------------------------------------------------------------------------------------------
@@ -182,6 +173,13 @@ class GatewayCore:
         self.master.events = []
         self._events += events
         if not self.loop.is_guarding_enabled:
+            if self._is_watching_nodes:
+                self._lost += [
+                    f"axis {self._axes[self._axis_of_node[event.node_id]].node.name}: node {event.node_id} "
+                    + ("has restarted" if isinstance(event, BootUpReceived) else "has fallen silent")
+                    for event in events
+                    if isinstance(event, (BootUpReceived, HeartbeatLost))
+                ]
             return
         for event in events:
             if isinstance(event, EmergencyReceived) and event.code:
@@ -206,7 +204,9 @@ class GatewayCore:
         if self._session is None:
             self._session = self._run()
         try:
-            if self._is_stop_requested and self._is_interruptible:
+            if self._lost and self._is_interruptible:
+                self._resume_at_ns = self._session.throw(CommissioningError(self._lost))
+            elif self._is_stop_requested and self._is_interruptible:
                 self._resume_at_ns = self._session.throw(OperatorStopError("stopped on request"))
             else:
                 self._resume_at_ns = next(self._session)
@@ -216,6 +216,9 @@ class GatewayCore:
         if self.master.events:
             self._events += self.master.events
             self.master.events = []
+
+    def _axis(self, node: NodeSettings) -> AxisSetup:
+        return self._axes[self._axis_of_node[node.node_id]]
 
     def _step(self, name: str) -> None:
         self._events.append(StepReached(self.master.now_ns, name))
@@ -239,6 +242,7 @@ class GatewayCore:
     def _commission(self) -> Procedure[None]:
         self._step("commissioning")
         yield from commission(self.master, self._nodes, self._network)
+        self._is_watching_nodes = True
         self._step("starting the cycle")
         start_nodes(self.master, self._nodes)
         self.loop.start(self.master.now_ns)
@@ -252,120 +256,53 @@ class GatewayCore:
                 ]
                 or ["the drives do not answer every SYNC with their TPDOs"]
             )
+        yield from for_all(self._nodes, lambda node: self.power.reset_fault(self._axis(node)))
 
     def _home_all(self) -> Procedure[None]:
         for axis in self._axes:
-            if axis.homing_method is None:
-                continue
-            self._step(f"homing axis {axis.node.name}")
-            yield from for_all([axis.node], lambda _, axis=axis: self._home(axis))
+            if axis.homing_method is not None:
+                yield from for_all([axis.node], lambda _, axis=axis: self._home(axis))
 
     def _home(self, axis: AxisSetup) -> Procedure[None]:
-        """Homing on the current position (CiA 402-2, methods 35 and 37)."""
-        node_id, channel = axis.node.node_id, axis.channel
-        yield from self.master.write(node_id, objects.HOMING_METHOD, 0, DataType.INTEGER8, axis.homing_method or 0)
-        yield from self._set_mode(axis, ModeOfOperation.HOMING)
-        yield from self._cycles(START_CYCLES)
-        if channel.statusword & Statusword.MODE_SPECIFIC_12 and not self._is_homing_again:
-            # To home it anew, wherever it stands, would give the linkage a wrong phase between its axes.
+        self._step(f"homing axis {axis.node.name}")
+        homed = yield from self.power.home(axis, self._is_homing_again)
+        if not homed:
             self._step(f"axis {axis.node.name} is homed already")
-            return
-        yield from self._enable(axis)
-        channel.controlword = cia402.COMMAND_ENABLE_OPERATION | int(cia402.Controlword.MODE_SPECIFIC_4)
-        # An earlier homing may still be shown as attained until the drive has seen the new start.
-        yield from self._cycles(START_CYCLES)
-        done = Statusword.TARGET_REACHED | Statusword.MODE_SPECIFIC_12
-        attained = yield from self.master.wait_for(
-            lambda: channel.statusword & done == done or bool(channel.statusword & Statusword.MODE_SPECIFIC_13),
-            HOMING_TIMEOUT_S,
-        )
-        if not attained or channel.statusword & Statusword.MODE_SPECIFIC_13:
-            raise CommissioningError(
-                [f"node {node_id}: homing failed, statusword {channel.statusword:04X}h (bit 13: homing error)"]
-            )
-        channel.controlword = cia402.COMMAND_ENABLE_OPERATION
-        yield from self._disable(axis)
-
-    def _cycles(self, count: int) -> Procedure[None]:
-        yield from self.master.pause(count * self.loop.period_ns / NS_PER_S)
-
-    def _set_mode(self, axis: AxisSetup, mode: ModeOfOperation) -> Procedure[None]:
-        node_id = axis.node.node_id
-        yield from self.master.write(node_id, objects.MODES_OF_OPERATION, 0, DataType.INTEGER8, int(mode))
-        deadline_ns = self.master.now_ns + round(MODE_TIMEOUT_S * NS_PER_S)
-        while True:
-            active = yield from self.master.read_int(node_id, objects.MODES_OF_OPERATION_DISPLAY, 0, DataType.INTEGER8)
-            if active == mode:
-                return
-            if self.master.now_ns >= deadline_ns:
-                raise NoAnswerError(node_id, f"mode of operation {int(mode)} (6061h stays {active})", MODE_TIMEOUT_S)
-            yield from self.master.pause(0.002)
-
-    def _enable(self, axis: AxisSetup) -> Procedure[None]:
-        """To Operation enabled, one transition after the other; a fault that is there from before is reset once."""
-        channel = axis.channel
-        if state_of(channel.statusword) in {State.FAULT, State.FAULT_REACTION_ACTIVE}:
-            channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
-            yield from self._cycles(START_CYCLES)
-            channel.controlword = cia402.COMMAND_FAULT_RESET
-            yield from self.master.wait_for(lambda: state_of(channel.statusword) is not State.FAULT, DISABLE_TIMEOUT_S)
-            channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
-        deadline_ns = self.master.now_ns + round(ENABLE_TIMEOUT_S * NS_PER_S)
-        while (state := state_of(channel.statusword)) is not State.OPERATION_ENABLED:
-            command = cia402.NEXT_COMMAND_TO_ENABLE[state]
-            if command is not None:
-                channel.controlword = command
-            if state is State.FAULT or self.master.now_ns >= deadline_ns:
-                raise NoAnswerError(
-                    axis.node.node_id, f"Operation enabled, it stays in '{state.value}'", ENABLE_TIMEOUT_S
-                )
-            yield from self.master.wait_for(
-                lambda state=state: state_of(channel.statusword) is not state,
-                (deadline_ns - self.master.now_ns) / NS_PER_S,
-            )
-
-    def _disable(self, axis: AxisSetup) -> Procedure[None]:
-        """To Ready to switch on or below: no torque, brake applied."""
-        channel = axis.channel
-        channel.controlword = cia402.COMMAND_SHUTDOWN
-        off = (State.READY_TO_SWITCH_ON, State.SWITCH_ON_DISABLED)
-        done = yield from self.master.wait_for(lambda: state_of(channel.statusword) in off, DISABLE_TIMEOUT_S)
-        if not done:
-            state = state_of(channel.statusword)
-            raise NoAnswerError(
-                axis.node.node_id, f"Ready to switch on, it stays in '{state.value}'", DISABLE_TIMEOUT_S
-            )
 
     def _enable_all(self) -> Procedure[None]:
         self._step("enabling the axes")
         mode = ModeOfOperation.CYCLIC_SYNCHRONOUS_POSITION
-        yield from for_all(self._nodes, lambda node: self._set_mode(self._axes[self._axis_of_node[node.node_id]], mode))
+        yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), mode))
         master, slave = (axis.channel.actual for axis in self._axes)
         targets = self._demand.align(self._plan.at(0.0)[0], (master, slave))
-        problems = [
-            f"axis {axis.node.name}: stands at {axis.channel.actual} counts, the cam starts at {target}, "
-            f"which is more than {START_WINDOW_COUNTS} counts away; bring the linkage to its home position"
-            for axis, target in zip(self._axes, targets, strict=True)
-            if abs(axis.channel.actual - target) > START_WINDOW_COUNTS
-        ]
+        problems: list[str] = []
+        for axis, target in zip(self._axes, targets, strict=True):
+            window = axis.channel.units.counts_in(START_WINDOW_RAD)
+            if abs(axis.channel.actual - target) > window:
+                problems.append(
+                    f"axis {axis.node.name}: stands at {axis.channel.actual} counts, the cam starts at {target}, "
+                    f"which is more than {window} counts away; bring the linkage to its home position"
+                )
         if problems:
             raise CommissioningError(problems)
-        # Until now the target of each axis was its actual position; from here on it is the cam's start, held.
-        yield from for_all(self._nodes, lambda node: self._enable(self._axes[self._axis_of_node[node.node_id]]))
+        # Until now the target of each axis was its actual position; from here on it is held where it then is.
+        yield from for_all(self._nodes, lambda node: self.power.enable(self._axis(node)))
         self.loop.is_guarding_enabled = True
         self.loop.phase = Phase.STANDSTILL
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.
         yield from self.master.pause(SETTLE_S)
-        self._step("moving")
-        self._demand.begin(self._plan)
-        self.loop.follow(self._demand)
         loop, demand, guard = self.loop, self._demand, self._guard
-        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
-            if self._is_stop_requested:
-                loop.controlled_stop()
-            yield self.master.now_ns + NS_PER_S
+        # What has called for a stop since the drives were commissioned has called for no motion at all.
+        if guard.reaction is None and not self._is_stop_requested:
+            self._step("moving")
+            demand.begin(self._plan, [axis.channel.target for axis in self._axes])
+            loop.follow(demand)
+            while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
+                if self._is_stop_requested:
+                    loop.controlled_stop()
+                yield self.master.now_ns + NS_PER_S
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self._is_stop_requested else StopReason.COMPLETED)
         if loop.phase is Phase.QUICK_STOP:
             self._step("quick stop")
@@ -379,7 +316,8 @@ class GatewayCore:
             before = [axis.channel.actual for axis in self._axes]
             yield from self.master.pause(STANDSTILL_SPAN_S)
             after = [axis.channel.actual for axis in self._axes]
-            if all(abs(b - a) <= STANDSTILL_COUNTS for a, b in zip(after, before, strict=True)):
+            limits = [max(STANDSTILL_COUNTS, axis.channel.units.counts_in(STANDSTILL_RAD)) for axis in self._axes]
+            if all(abs(b - a) <= limit for a, b, limit in zip(after, before, limits, strict=True)):
                 return True
         return False
 
@@ -387,6 +325,7 @@ class GatewayCore:
         """Disable every drive, by RPDO while the cycle runs, and take the nodes out of NMT operational."""
         loop = self.loop
         loop.is_guarding_enabled = False
+        disabled = True
         if loop.is_running:
             self._step("disabling the axes")
             if loop.phase is Phase.QUICK_STOP:
@@ -406,7 +345,8 @@ class GatewayCore:
         for node in self._nodes:
             self.master.watch_heartbeat(node.node_id, 0.0)
             self.master.command(NmtCommand.ENTER_PRE_OPERATIONAL, node.node_id)
-        for node in self._nodes:
+        # A drive that may still be enabled must miss our heartbeat.
+        for node in self._nodes if disabled else ():
             # Else every drive would miss our heartbeat, and say so on the bus, as soon as we are gone.
             with suppress(NodeError):
                 yield from release_heartbeat(self.master, node)

@@ -206,7 +206,9 @@ class CyclicLoop:
             self._demand.controlled_stop()
 
     def quick_stop(self) -> None:
-        """Quick stop on every drive; the demand is left behind."""
+        """Quick stop on every drive; the demand is left behind. Does nothing to drives that are being disabled."""
+        if self.phase in {Phase.QUICK_STOP, Phase.DISABLED}:
+            return
         self.is_guarding_enabled = False
         self.command(COMMAND_QUICK_STOP)
         self._demand = None
@@ -334,7 +336,7 @@ class CyclicLoop:
 
     def react(self) -> None:
         """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
-        if self.guard.reaction is Reaction.QUICK_STOP and self.phase is not Phase.QUICK_STOP:
+        if self.guard.reaction is Reaction.QUICK_STOP:
             self.quick_stop()
         elif self.guard.reaction is Reaction.CONTROLLED_STOP:
             self.controlled_stop()

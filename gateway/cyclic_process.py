@@ -15,7 +15,9 @@ from types import FrameType
 from typing import Final
 
 from config.loading import parse_config
+from drivers.cia402 import COMMAND_QUICK_STOP
 from drivers.errors import BusError, DriveError
+from drivers.frame import Frame
 from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
 from drivers.node import Event
 from drivers.ports import Port
@@ -23,6 +25,7 @@ from drivers.real_time import try_realtime
 from gateway.bus_address import BusAddress
 from gateway.child_process import end_with
 from gateway.core import GatewayCore
+from gateway.cycle import RPDO_LAYOUT, SYNC_FRAME
 from gateway.errors import GatewayError
 from gateway.event_text import describe
 from gateway.guard import StopReason
@@ -127,6 +130,28 @@ def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
     return request
 
 
+def stop_drives(core: GatewayCore, port: Port) -> None:
+    """Last resort after a failure of our own: quick stop to every drive, taken over by one more SYNC.
+
+    If even this does not reach them, they miss our heartbeat and their set-points, and stop by themselves.
+    """
+    for axis in core.loop.axes:
+        port.send(Frame(axis.rpdo_cob_id, RPDO_LAYOUT.pack(COMMAND_QUICK_STOP, axis.target, 0)))
+    port.send(SYNC_FRAME)
+
+
+def run_guarded(core: GatewayCore, port: Port, poll: Callable[[], None]) -> None:
+    """``run_core`` by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
+    try:
+        run_core(core, port, time.monotonic_ns, poll)
+    except BusError:
+        raise
+    except Exception:
+        if core.loop.is_running:
+            stop_drives(core, port)
+        raise
+
+
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
     """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
     config = parse_config(job.config_text, Path(job.config_path))
@@ -168,7 +193,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
             )
         refuse_other_master(port, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
         ring.set_state(RunState.RUNNING)
-        run_core(core, port, time.monotonic_ns, poll)
+        run_guarded(core, port, poll)
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:

@@ -1,5 +1,6 @@
 """Where the demand comes from: the master's plan, the cam, and their conversion into counts, one step a cycle."""
 
+from collections.abc import Sequence
 from typing import Final, Protocol
 
 from gateway.sample import Phase
@@ -7,6 +8,7 @@ from gateway.units import AxisUnits, wrap_counts
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import MasterPhase, MasterPlan, plan_stop
 
+APPROACH_S: Final = 0.25
 MASTER: Final = 0
 SLAVE: Final = 1
 
@@ -67,6 +69,9 @@ class CamDemand:
         self._is_stopping = False
         self._turns = (0, 0)
         """Whole revolutions, in counts, that each axis stands away from the plan's: see ``align``."""
+        self._approach = (0, 0)
+        self._approach_left = 0
+        self._approach_steps = 1
         self.targets = [0, 0]
         self.torque_offsets = [0, 0]
         self.velocities = [0.0, 0.0]
@@ -74,8 +79,19 @@ class CamDemand:
         self.master_velocity = 0.0
         self.phase = Phase.STANDSTILL
 
-    def begin(self, plan: MasterPlan) -> None:
-        """Follow ``plan`` from its start with the next step."""
+    def begin(self, plan: MasterPlan, held_targets: Sequence[int]) -> None:
+        """Follow ``plan`` from its start with the next step.
+
+        ``held_targets`` (counts) is where the axes are held now: what they are away from the plan's start is taken back
+        smoothly within ``APPROACH_S``, so that no target ever jumps.
+        """
+        self._follow(plan)
+        start = self.align(self.master_position, (held_targets[MASTER], held_targets[SLAVE]))
+        self._approach = (held_targets[MASTER] - start[MASTER], held_targets[SLAVE] - start[SLAVE])
+        self._approach_left = round(APPROACH_S / self._period_s) if any(self._approach) else 0
+        self._approach_steps = max(self._approach_left, 1)
+
+    def _follow(self, plan: MasterPlan) -> None:
         self._plan = plan
         self._step = 0
         self._is_stopping = False
@@ -118,6 +134,12 @@ class CamDemand:
             wrap_counts(self._units[MASTER].counts(position) + master_turns),
             wrap_counts(self._units[SLAVE].counts(theta5) + slave_turns),
         ]
+        if self._approach_left:
+            self._approach_left -= 1
+            left = self._approach_left / self._approach_steps
+            share = left * left * (3.0 - 2.0 * left)
+            for number, away in enumerate(self._approach):
+                self.targets[number] = wrap_counts(self.targets[number] + round(share * away))
         self.torque_offsets = [0, 0]
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         self.phase = phase
@@ -129,5 +151,5 @@ class CamDemand:
         if self._is_stopping or self._plan is None:
             return
         plan = plan_stop(self.master_position, self.master_velocity, self._acceleration, *self._limits)
-        self.begin(plan)
+        self._follow(plan)
         self._is_stopping = True

@@ -11,11 +11,12 @@ from config.conversion import desired_curve, five_bar, home_angles
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
 from gateway.commissioning import NetworkSettings, NodeSettings
-from gateway.core import START_WINDOW_COUNTS, AxisSetup, GatewayCore
+from gateway.core import START_WINDOW_RAD, GatewayCore
 from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
+from gateway.powering import AxisSetup
 from gateway.units import AxisUnits
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
@@ -144,13 +145,14 @@ def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[Gateway
     distance = axis_units(slave).counts(on_cam)
     if profile.net_turns:
         distance = round(math.remainder(distance, slave.counts_per_revolution))
-    if slave.homing_method is None or abs(distance) <= START_WINDOW_COUNTS:
+    window = axis_units(slave).counts_in(START_WINDOW_RAD)
+    if slave.homing_method is None or abs(distance) <= window:
         return []
     name = config.axis_names[1]
     return [
         GatewayError(
             f"axes.{name}.home_angle_deg: {math.degrees(theta5):g} is {abs(distance)} counts from the cam, which has "
-            f"{math.degrees(on_cam):.3f} deg where the master is at home (bound {START_WINDOW_COUNTS} counts)"
+            f"{math.degrees(on_cam):.3f} deg where the master is at home (bound {window} counts)"
         )
     ]
 

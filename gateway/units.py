@@ -34,6 +34,10 @@ class AxisUnits:
         """Link angle in rad of a position in counts."""
         return counts * math.tau / self.counts_per_revolution + self.home_angle_rad
 
+    def counts_in(self, angle_rad: float) -> int:
+        """A difference in rad as counts."""
+        return round(angle_rad * self.counts_per_revolution / math.tau)
+
     def degrees(self, counts: float) -> float:
         """A difference in counts as degrees."""
         return counts * 360.0 / self.counts_per_revolution

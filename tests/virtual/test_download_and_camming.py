@@ -11,12 +11,13 @@ from drivers.object_dictionary import DataType
 from drivers.pdo import MappingEntry
 from drivers.virtual_time import VirtualBus
 from gateway.commissioning import map_pdo
-from gateway.core import AxisSetup, GatewayCore
+from gateway.core import GatewayCore
 from gateway.cycle import AxisChannel, CyclicLoop
 from gateway.demand import CamDemand
 from gateway.download import download_image
 from gateway.errors import GatewayError
 from gateway.guard import Guard, StopReason
+from gateway.powering import AxisPower, AxisSetup
 from gateway.preparation import axis_units, build_master, network_settings, node_settings, prepare
 from gateway.procedure_core import ProcedureCore
 from gateway.sample import Phase, SampleLayout
@@ -93,8 +94,12 @@ class CammingCore(GatewayCore):
         )
         yield from map_pdo(self.master, 2, 0x1401, 0x1601, 0x181, entries)
 
-    def _set_mode(self, axis, mode):
-        yield from super()._set_mode(axis, -2 if (axis.node.node_id, mode) == (2, 8) else mode)
+
+class CammingPower(AxisPower):
+    """Puts the servo drive into camming where the gateway means cyclic synchronous position."""
+
+    def set_mode(self, axis, mode):
+        yield from super().set_mode(axis, -2 if (axis.node.node_id, mode) == (2, 8) else mode)
 
 
 def test_the_drive_runs_the_downloaded_cam_against_the_actual_position_of_the_cv_axis(prepared, image):
@@ -116,6 +121,7 @@ def test_the_drive_runs_the_downloaded_cam_against_the_actual_position_of_the_cv
     loop = CyclicLoop(channels, 1_000_000, guard, Sink())
     demand = CamDemand(prepared.cam.profile, (channels[0].units, channels[1].units), 0.001, 6.0, 30.0)
     core = CammingCore(setups, network_settings(PAPER), build_master(PAPER), loop, demand, prepared.plan, guard)
+    core.power = CammingPower(core.master, loop)
     # The servo's own target must play no part: it stays where it was.
     step = demand.step
 
