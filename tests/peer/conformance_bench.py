@@ -7,6 +7,7 @@ what has to come back, stands in the tests.
 import functools
 from collections.abc import Sequence
 from dataclasses import replace
+from math import tau
 
 from drivers.eds import load_eds
 from drivers.frame import Frame
@@ -35,6 +36,7 @@ def build(node_ids: Sequence[int], settings: DriveSettings | None, noise_counts:
             described(node_id),
             replace(common, identity=replace(common.identity, serial_number=node_id)),
             decode_cam_image,
+            describe=described,
         )
         for node_id in node_ids
     ]
@@ -139,6 +141,11 @@ class Bus:
     @property
     def drive(self):
         return self.machine.drives[0]
+
+    @property
+    def shaft_counts(self) -> float:
+        """Where the axis really is: the angle of the plant."""
+        return self.machine.plant.angle(0) * 4096 / tau
 
     def trip(self, code: int = 0x2310, register: int = 0x02, persists: bool = False) -> list[str]:
         """Over-current by default; gives the frames of that instant."""

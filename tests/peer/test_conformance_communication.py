@@ -766,7 +766,6 @@ def test_row_28_device_type_and_identity(bus: Bus):
     assert [bus.value(f"18100{n}") for n in (1, 2, 3, 4)] == [0x4D2, 0x1024, 0x10000, 5]
 
 
-@pytest.mark.xfail(strict=False, reason="the LSS slave is not there yet")
 def test_row_28_lss_inquires_the_identity_of_1018h(bus: Bus):
     assert bus.send("7E5#0401000000000000") == []  # all into configuration
     assert bus.send("7E5#5A00000000000000") == ["7E4#5AD2040000000000"]
@@ -778,13 +777,12 @@ def test_row_28_lss_inquires_the_identity_of_1018h(bus: Bus):
     assert bus.send("7E5#5E00000000000000") == []
 
 
-@pytest.mark.xfail(strict=False, reason="the LSS slave is not there yet")
 def test_row_28_lss_selects_by_identity(bus: Bus):
     for serial, answers in (("06", []), ("05", ["7E4#4400000000000000"])):
         assert bus.send("7E5#40D2040000000000") == []
         assert bus.send("7E5#4124100000000000") == []
         assert bus.send("7E5#4200000100000000") == []
-        assert bus.send(f"7E5#43{serial}00000000000000") == answers
+        assert bus.send(f"7E5#43{serial}000000000000") == answers
     # Node id 6, after the next reset of communication.
     assert bus.send("7E5#1106000000000000") == ["7E4#1100000000000000"]
     assert bus.send("7E5#1180000000000000") == ["7E4#1101000000000000"]  # 128 is none
@@ -797,7 +795,6 @@ def test_row_28_lss_selects_by_identity(bus: Bus):
     assert bus.sdo(DEVICE_TYPE[0]) == ""
 
 
-@pytest.mark.xfail(strict=False, reason="the LSS slave is not there yet")
 def test_row_28_lss_identify(bus: Bus):
     for low, high, answers in (
         ("04000000", "06000000", ["7E4#4F00000000000000"]),
@@ -811,7 +808,6 @@ def test_row_28_lss_identify(bus: Bus):
         assert sent == answers
 
 
-@pytest.mark.xfail(strict=False, reason="the LSS slave is not there yet")
 def test_row_28_lss_fastscan_finds_the_identity_of_1018h(bus: Bus):
     # A configured node takes no part.
     assert bus.send("7E5#5100000000800000") == []

@@ -1,10 +1,13 @@
 """Conformance of the emulated drive as a CiA 402 device, rows 18 to 27: every byte written out by hand."""
 
+from math import inf
+
 import pytest
 from conformance_bench import Bus
 
 from sim_drive.assembly import FREE_AXIS_GAINS
 from sim_drive.settings import DriveSettings
+from sim_drive.switches import Switches
 
 RANGE = 0x06090030
 START, STOP, PRE_OPERATIONAL, RESET_NODE = "000#0105", "000#0205", "000#8005", "000#8105"
@@ -858,6 +861,104 @@ def test_row_26_changing_the_offset_does_not_move_the_position(bus: Bus):
     bus.done("237C6000E8030000")
     bus.run(20)
     assert position(bus) == 0
+
+
+# Limit switches at -9000 and 9000 counts, index pulses every 4096 counts from 500 on (-7692, -3596, 500, 4596, 8692).
+# The home switch is on from 1000 to 1400; for methods 3, 4, 19, 20 from 1000 on, for 5, 6, 21, 22 up to 1400.
+# Where home is, in counts of the shaft, by the standard's figures of the methods.
+HOMES = {
+    1: -7692, 2: 8692,
+    3: 500, 4: 4596, 5: 4596, 6: 500,
+    7: 500, 8: 4596, 9: 500, 10: 4596, 11: 4596, 12: 500, 13: 4596, 14: 500,
+    17: -9000, 18: 9000,
+    19: 1000, 20: 1000, 21: 1400, 22: 1400,
+    23: 1000, 24: 1000, 25: 1400, 26: 1400, 27: 1400, 28: 1400, 29: 1000, 30: 1000,
+    33: -3596, 34: 500,
+}  # fmt: skip
+
+
+def at_switches(method: int) -> Bus:
+    home = (1000.0, 1400.0)
+    if method in {3, 4, 19, 20}:
+        home = (1000.0, inf)
+    elif method in {5, 6, 21, 22}:
+        home = (-inf, 1400.0)
+    bus = Bus(settings=DriveSettings(gains=FREE_AXIS_GAINS, switches=Switches(-9000, 9000, home, 500)))
+    # 20000 counts/s towards the switch, 2000 counts/s at it, 400000 counts/s^2.
+    bus.done("23996001204E0000", "23996002D0070000", "239A6000801A0600", "2365600000100000")
+    bus.done(f"2F986000{method:02X}000000")
+    return bus
+
+
+@pytest.mark.parametrize("method", HOMES)
+def test_row_26_homing_on_switches_and_index_pulses(method: int):
+    bus = at_switches(method)
+    bus.done("237C6000E8030000")  # home is 1000
+    bus.enable("06")
+    control(bus, 0x1F)
+    highest = 0
+    for _ in range(20_000):
+        statusword = bus.statusword
+        assert statusword & 0x6F == 0x27
+        assert not statusword & BIT_13
+        if statusword & BIT_12 and statusword & TARGET_REACHED:
+            break
+        # Bit 12 alone: attained, and still on the way to a stop; bit 10 comes last.
+        highest = max(highest, abs(velocity(bus)))
+        bus.run(1)
+    else:
+        raise AssertionError("homing does not end")
+    assert 1000 < highest < 30_000 or method in {33, 34}
+    control(bus, 0x0F)
+    bus.run(100)
+    # The edge is that of home, not where the axis has come to rest after it.
+    assert bus.shaft_counts - (position(bus) - 1000) == pytest.approx(HOMES[method], abs=2)
+    assert bus.statusword & (TARGET_REACHED | BIT_12 | BIT_13) == TARGET_REACHED | BIT_12
+
+
+def test_row_26_homing_comes_to_rest_after_its_edge():
+    bus = at_switches(24)
+    bus.enable("06")
+    control(bus, 0x1F)
+    wait(bus, BIT_12, True)
+    bus.run(200)
+    assert position(bus) > 0  # beyond home, in the direction in which the edge was crossed
+
+
+def test_row_26_dropping_bit_4_aborts():
+    bus = at_switches(18)
+    bus.enable("06")
+    control(bus, 0x1F)
+    bus.run(100)
+    assert not bus.statusword & (TARGET_REACHED | BIT_12 | BIT_13)
+    assert velocity(bus) > 10_000
+    before = position(bus)
+    control(bus, 0x0F)
+    bus.run(1000)
+    assert bus.statusword & (TARGET_REACHED | BIT_12 | BIT_13) == TARGET_REACHED
+    assert before < position(bus) < before + 2000
+    assert abs(velocity(bus)) < 1100
+    # From there again.
+    control(bus, 0x1F)
+    bus.run(3000)
+    assert bus.statusword & (TARGET_REACHED | BIT_12 | BIT_13) == TARGET_REACHED | BIT_12
+
+
+def test_row_26_a_switch_that_is_never_found_is_a_homing_error():
+    bus = Bus(settings=DriveSettings(gains=FREE_AXIS_GAINS, switches=Switches(-2000, 2000, (5000.0, 6000.0), 0)))
+    bus.done("23996001204E0000", "23996002D0070000", "239A6000801A0600", "2F98600018000000")
+    bus.enable("06")
+    control(bus, 0x1F)
+    bus.run(3000)
+    assert bus.statusword & (BIT_12 | BIT_13) == BIT_13
+    assert state(bus) == "operation enabled"
+    assert abs(velocity(bus)) < 1100
+    # The next start clears it.
+    control(bus, 0x0F)
+    bus.done("2F98600025000000")
+    control(bus, 0x1F)
+    bus.run(50)
+    assert bus.statusword & (TARGET_REACHED | BIT_12 | BIT_13) == TARGET_REACHED | BIT_12
 
 
 # -- row 27: several axes in one node ----------------------------------------------------------------------------------
