@@ -129,6 +129,18 @@ def test_displacement_is_the_span_of_the_actual_position() -> None:
     assert (axis.position_actual_counts.max, axis.position_actual_counts.min) == (1135.0, 0.0)
 
 
+def test_positions_that_wrap_are_no_errors_and_no_displacements() -> None:
+    samples = steady_run()
+    continuous = 2**31 - 1000 + np.arange(2000)
+    samples["position_demand"][:, 1] = continuous.astype(np.uint32).view(np.int32)
+    samples["position_actual"][:, 1] = (continuous - 7).astype(np.uint32).view(np.int32)
+    axis = report(samples).steady.axes[1]
+    assert (axis.following_error_counts.max, axis.following_error_counts.min) == (7.0, 7.0)
+    assert axis.displacement_deg == pytest.approx(1999 * 360 / 4096)
+    # one count a cycle of 1 ms
+    assert (axis.velocity_actual_counts_per_s.max, axis.velocity_actual_counts_per_s.min) == (1000.0, 1000.0)
+
+
 @pytest.mark.parametrize(("records", "cycles"), [(999, 0), (1000, 1), (1999, 1), (2000, 2), (2500, 2)])
 def test_machine_cycles_are_whole_revolutions_at_constant_speed(records: int, cycles: int) -> None:
     samples = steady_run(3000)
