@@ -1,7 +1,6 @@
 """One session with every service and every mode of the emulated drive, before tshark's CANopen dissector."""
 
 import binascii
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -167,7 +166,7 @@ def test_every_frame_of_every_service_is_sound(bus: Bus, log: Path, dissect: Dis
 
 
 def test_the_dissector_sees_what_was_meant(log: Path, dissect: Dissect) -> None:
-    said = {re.sub(r"[ ,:]*(\[?0x|\[|Configuration|Waiting).*", "", row[0]) for row in dissect(log, "_ws.col.Info")}
+    said = {row[0] for row in dissect(log, "_ws.col.Info")}
     sentences = {
         "NMT: Start remote node",
         "NMT: Stop remote node",
@@ -207,4 +206,4 @@ def test_the_dissector_sees_what_was_meant(log: Path, dissect: Dissect) -> None:
         "LSS (Master): LSS Fastscan protocol",
         "LSS (Master): Identify non-configured remote slave protocol",
     }
-    assert sentences - said == set(), sorted(said)
+    assert [sentence for sentence in sentences if not any(row.startswith(sentence) for row in said)] == []
