@@ -35,6 +35,7 @@ from sim_drive.modes.base import OperationMode
 from sim_drive.modes.camming import Camming
 from sim_drive.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
 from sim_drive.modes.homing import Homing, HomingStatus
+from sim_drive.modes.interpolated import InterpolatedPosition
 from sim_drive.modes.profile_position import ProfilePosition
 from sim_drive.modes.profile_torque import ProfileTorque
 from sim_drive.modes.profile_velocity import ProfileVelocity
@@ -70,6 +71,7 @@ _TIMED_MODES: Final = frozenset(
         Mode.CYCLIC_SYNCHRONOUS_POSITION,
         Mode.CYCLIC_SYNCHRONOUS_VELOCITY,
         Mode.CYCLIC_SYNCHRONOUS_TORQUE,
+        Mode.INTERPOLATED_POSITION,
         Mode.CAMMING,
     }
 )
@@ -166,6 +168,7 @@ class Axis(Motion):
             Mode.PROFILE_POSITION: ProfilePosition(self),
             Mode.PROFILE_VELOCITY: ProfileVelocity(self),
             Mode.PROFILE_TORQUE: ProfileTorque(self),
+            Mode.INTERPOLATED_POSITION: InterpolatedPosition(self),
             Mode.CYCLIC_SYNCHRONOUS_POSITION: CyclicPosition(self),
             Mode.CYCLIC_SYNCHRONOUS_VELOCITY: CyclicVelocity(self),
             Mode.CYCLIC_SYNCHRONOUS_TORQUE: CyclicTorque(self),
@@ -472,7 +475,7 @@ class Axis(Motion):
     def _stop(self, ramp: StopRamp, now_ns: int) -> None:
         """Leave the active mode, and let the demand come to rest."""
         self._deactivate(now_ns)
-        self.demand.brake(now_ns, self.deceleration_of(ramp))
+        self.brake(self.deceleration_of(ramp), now_ns)
 
     def lose_connection(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
         """The master is gone: EMCY, and, if the axis is enabled, what the option code 6007h says."""
@@ -524,6 +527,14 @@ class Axis(Motion):
             elif self._state is PowerState.OPERATION_ENABLED:
                 self._stop(ramp, now_ns)
         self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)
+
+    def warn(self, error_code: int, register_bits: int, now_ns: int) -> None:
+        """Raise an error that leads to no fault: EMCY alone."""
+        self._emergency.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=False)
+
+    def end_warning(self, error_code: int, now_ns: int) -> None:
+        """The cause of an error that has led to no fault is gone."""
+        self._emergency.end_cause(error_code, now_ns)
 
     # -- modes ---------------------------------------------------------------------------------------------------
 

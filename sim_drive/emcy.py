@@ -45,6 +45,8 @@ class EmergencyCode(IntEnum):
     """Camming was asked for without a valid table in the selected slot."""
     CAM_JUMP = 0xFF21
     """Engaging the cam would make the axis jump."""
+    INTERPOLATION_UNDERFLOW = 0xFF22
+    """The buffer of the interpolated position mode has run empty in motion."""
 
 
 class ErrorRegister(IntFlag):

@@ -124,6 +124,14 @@ class Motion(ABC):
         """Raise an error that leads to a fault."""
 
     @abstractmethod
+    def warn(self, error_code: int, register_bits: int, now_ns: int) -> None:
+        """Raise an error that leads to no fault."""
+
+    @abstractmethod
+    def end_warning(self, error_code: int, now_ns: int) -> None:
+        """The cause of an error that has led to no fault is gone."""
+
+    @abstractmethod
     def show_status(self) -> None:
         """Compose statusword and modes of operation display anew: something they show has changed."""
 
@@ -197,18 +205,36 @@ class Motion(ABC):
     def slow_down(self, now_ns: int) -> None:
         """Bring the demand to rest with the profile deceleration, if it moves."""
         if not self.demand.is_over(now_ns):
-            self.demand.brake(now_ns, self.deceleration)
+            self.brake(self.deceleration, now_ns)
 
     def halt(self, now_ns: int) -> None:
         """Bring the demand to rest as the halt option code 605Dh says."""
         self.is_guarded = False
-        self.demand.brake(now_ns, self.deceleration_of(STOP_RAMPS[int(self._halt_option.value)]))
+        self.brake(self.deceleration_of(STOP_RAMPS[int(self._halt_option.value)]), now_ns)
 
     def take_over(self, now_ns: int) -> None:
         """Let the position controller have an axis again that a torque moved: from where it is, to rest."""
         self.torque_demand = None
         self.demand.launch(float(self.shaft_counts), self.latch(now_ns)[1], now_ns)
-        self.demand.brake(now_ns, self.deceleration)
+        self.brake(self.deceleration, now_ns)
+
+    def _place(self, now_ns: int) -> float:
+        """The demand in the user frame."""
+        here = self.demand.at(now_ns)
+        whole = floor(here)
+        return wrap_int32(whole + self.offset) + here - whole
+
+    def brake(self, deceleration: float, now_ns: int) -> None:
+        """Ramp the demand down to rest; more steeply, if it would else come to rest beyond a software limit 607Dh."""
+        low = self.limit_low.value
+        high = self.limit_high.value
+        if low < high and not (low == -_HALF and high == _HALF - 1):
+            velocity = self.demand.velocity_at(now_ns)
+            place = self._place(now_ns)
+            room = high - place if velocity > 0.0 else place - low
+            if room > 0.0:
+                deceleration = max(deceleration, velocity * velocity / (2.0 * room))
+        self.demand.brake(now_ns, deceleration)
 
     def stop_at_limits(self, now_ns: int) -> bool:
         """Brake where the demand would else leave the software position limits 607Dh; whether it had to.
@@ -223,7 +249,7 @@ class Motion(ABC):
         demand = self.demand
         least, greatest = demand.span_ahead(now_ns)
         here = demand.at(now_ns)
-        place = wrap_int32(floor(here) + self.offset) + here - floor(here)
+        place = self._place(now_ns)
         if place + greatest - here <= high and place + least - here >= low:
             return False
         velocity = demand.velocity_at(now_ns)

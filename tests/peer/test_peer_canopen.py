@@ -106,6 +106,8 @@ def test_every_object_of_the_eds_is_there_with_its_type_and_default(node: BaseNo
         try:
             data = node.sdo.upload(*place)
         except SdoAbortedError as abort:
+            if variable.access_type == "wo" and abort.code == 0x06010001:
+                continue
             if not (place in WITHOUT_DATA and abort.code == NO_DATA_AVAILABLE):
                 wrong.append(f"{name}: {abort}")
             continue
@@ -163,7 +165,7 @@ def test_what_is_written_is_read_back(node: BaseNode402, index: int, subindex: i
         (0x60C2, 2, b"\xf9", 0x06090032),
         (0x6065, 0, b"\0\0", 0x06070013),
         (0x6040, 0, b"\0\0\0\0", 0x06070012),
-        (0x6098, 0, b"\x01", 0x06090030),
+        (0x6098, 0, b"\x0f", 0x06090030),
         (0x6060, 0, b"\x03", 0x06090030),
         (0x1A01, 0, b"\x09", 0x06090031),
     ],
@@ -306,7 +308,8 @@ def test_base_node_402_homes_on_the_current_position(node: BaseNode402, method: 
     values = set_up_pdos(node)
     assert node.is_op_mode_supported("HOMING")
     assert node.is_op_mode_supported("CYCLIC SYNCHRONOUS POSITION")
-    assert not node.is_op_mode_supported("PROFILED POSITION")
+    assert node.is_op_mode_supported("PROFILED POSITION")
+    assert not node.is_op_mode_supported("VELOCITY")
     assert not node.is_homed()
     node.sdo[0x6098].raw = method
     node.sdo[0x607C].raw = offset
