@@ -186,6 +186,7 @@ class VirtualBus:
         self.refresh()
         late = self._late
         queues = self._numbered_queues
+        wire_ns = self._wire_ns
         now_ns = self._now_ns
         sender = self._sender
         frame = self._on_wire
@@ -196,19 +197,26 @@ class VirtualBus:
         try:
             while condition is None or condition():
                 next_ns = self._earliest_wake_ns
-                if frame_end_ns < next_ns:
+                is_frame_ending = frame_end_ns <= next_ns
+                if is_frame_ending:
                     next_ns = frame_end_ns
                 if late and late[0][0] < next_ns:
                     next_ns = late[0][0]
+                    is_frame_ending = False
                 if next_ns > limit_ns:
                     self._now_ns = limit_ns
                     return False
                 if next_ns > now_ns:
                     self._now_ns = now_ns = next_ns
-                if frame_end_ns <= now_ns:
+                if is_frame_ending:
                     ended, frame, frame_end_ns = frame, None, _NEVER
                     if ended is not None:
-                        self._end_frame(sender, ended, now_ns)
+                        self._busy_ns += wire_ns[len(ended.data)]
+                        self._frame_count += 1
+                        if self._faults is None:
+                            self._deliver(sender, ended, now_ns)
+                        else:
+                            self._deliver_at_fault(self._faults, sender, ended, now_ns)
                 if late:
                     self._deliver_late(now_ns)
                 if self._earliest_wake_ns <= now_ns:
@@ -225,21 +233,16 @@ class VirtualBus:
                                 sender = index
                     if best != _NEVER:
                         frame = self._queues[sender].popleft()
-                        frame_end_ns = now_ns + self._wire_ns[len(frame.data)]
+                        frame_end_ns = now_ns + wire_ns[len(frame.data)]
         finally:
             self._sender = sender
             self._on_wire = frame
             self._frame_end_ns = frame_end_ns
         return True
 
-    def _end_frame(self, sender: int, frame: Frame, now_ns: int) -> None:
-        """A frame has left the wire: deliver it, or do with it what the faults say."""
-        self._busy_ns += self._wire_ns[len(frame.data)]
-        self._frame_count += 1
-        if self._faults is None:
-            self._deliver(sender, frame, now_ns)
-            return
-        for delay_ns in self._faults.delays_ns(sender, frame, now_ns, self._source):
+    def _deliver_at_fault(self, faults: BusFaults, sender: int, frame: Frame, now_ns: int) -> None:
+        """Do with a frame that has left the wire what the faults say."""
+        for delay_ns in faults.delays_ns(sender, frame, now_ns, self._source):
             if delay_ns <= 0:
                 self._deliver(sender, frame, now_ns)
             else:

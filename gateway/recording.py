@@ -12,7 +12,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from itertools import starmap
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self, cast
@@ -21,6 +20,7 @@ import numpy as np
 from mcap.records import Attachment, Channel, Footer, Message, Metadata
 from numpy.typing import NDArray
 
+from drivers.frame import Frame
 from gateway.errors import UsageError
 from gateway.mcap_file import Bodies, McapError, McapWriter, RawChunk, Scanned, scan, split_records
 from gateway.ring import FRAME_DTYPE, FRAME_STRUCT, FrameArray, RunEvent
@@ -223,18 +223,29 @@ class RecordingSink:
 
     def __init__(self, writer: RecordingWriter) -> None:
         self._writer = writer
-        self._samples: list[tuple[float, ...]] = []
-        self._frames: list[tuple[int, int, bool, int, bytes]] = []
+        self._pack = writer.layout.pack
+        self._pack_frame = FRAME_STRUCT.pack
+        self._limit = _SINK_SAMPLES * writer.layout.size
+        # Packed at once: thousands of tuples kept until the next flush would keep the garbage collector busy.
+        self._samples = bytearray()
+        self._frames = bytearray()
+        self._put_sample = self._samples.extend
+        self._put_frame = self._frames.extend
 
     def append(self, *values: float) -> None:
         """Take one sample; see ``ring.Sink``."""
-        self._samples.append(values)
-        if len(self._samples) >= _SINK_SAMPLES:
+        self._put_sample(self._pack(*values))
+        if len(self._samples) >= self._limit:
             self.flush()
 
     def append_frame(self, at_ns: int, cob_id: int, data: bytes, is_remote: bool = False) -> None:
         """Take one CAN frame; see ``ring.Sink``."""
-        self._frames.append((at_ns, cob_id, is_remote, len(data), data))
+        self._put_frame(self._pack_frame(at_ns, cob_id, is_remote, len(data), data))
+
+    def trace(self, at_ns: int, frame: Frame) -> None:
+        """Take one CAN frame from the virtual bus."""
+        cob_id, data, is_remote = frame
+        self._put_frame(self._pack_frame(at_ns, cob_id, is_remote, len(data), data))
 
     def append_event(self, at_ns: int, kind: str, text: str, **data: str | int | float | bool | None) -> None:
         """Take one event; see ``ring.Sink``."""
@@ -243,12 +254,10 @@ class RecordingSink:
     def flush(self) -> None:
         """Hand everything to the writer; call it before the writer is closed."""
         if self._samples:
-            packed = b"".join(starmap(self._writer.layout.pack, self._samples))
-            self._writer.write_samples(np.frombuffer(packed, self._writer.layout.dtype))
+            self._writer.write_samples(np.frombuffer(bytes(self._samples), self._writer.layout.dtype))
             self._samples.clear()
         if self._frames:
-            packed = b"".join(starmap(FRAME_STRUCT.pack, self._frames))
-            self._writer.write_frames(np.frombuffer(packed, FRAME_DTYPE))
+            self._writer.write_frames(np.frombuffer(bytes(self._frames), FRAME_DTYPE))
             self._frames.clear()
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from drivers.frame import Frame
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
 from gateway.core import GatewayCore
@@ -47,15 +46,14 @@ def run_virtual(
         sink = RecordingSink(writer)
         core = build_core(config, prepared.cam.profile, prepared.plan, sink)
 
-        def trace(at_ns: int, frame: Frame) -> None:
-            sink.append_frame(at_ns, frame.cob_id, frame.data, frame.is_remote)
-
         def on_event(node: int, event: Event) -> None:
             kind, text, data = describe(event)
             source = "gateway" if node == GATEWAY_NODE else "emulator"
             sink.append_event(event.at_ns, kind, text, source=source, **data)
 
-        bus = VirtualBus([core, machine], config.bus.bit_rate, seed, trace if with_frames else None, on_event=on_event)
+        bus = VirtualBus(
+            [core, machine], config.bus.bit_rate, seed, sink.trace if with_frames else None, on_event=on_event
+        )
         limit_ns = round((prepared.plan.duration_s + MAX_EXTRA_S) * NS_PER_S)
         while not core.is_done and bus.now_ns < limit_ns:
             bus.run_while(lambda: not core.is_done, min(bus.now_ns + PROGRESS_SPAN_NS, limit_ns))

@@ -344,7 +344,17 @@ class CoupledPlant:
     Raises ValueError where the linkage is singular, or does not close, at the initial angles (rad).
     """
 
-    __slots__ = ("_dynamics", "_settings", "_state", "_step_s", "_steps", "_torn_at_s", "_values", "parameters")
+    __slots__ = (
+        "_constants",
+        "_dynamics",
+        "_settings",
+        "_state",
+        "_step_s",
+        "_steps",
+        "_torn_at_s",
+        "_values",
+        "parameters",
+    )
 
     def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float) -> None:
         self.parameters = parameters
@@ -369,26 +379,16 @@ class CoupledPlant:
         self._state = np.array(self._values)
         self._steps = 0
         self._torn_at_s: float | None = None
-        # Compiled here rather than in the first servo period, where it would make a real-time host seconds late.
-        self._run(self._state.copy(), 0.0, 0.0, False, False)
-
-    def _run(
-        self, state: Float, command2: float, command5: float, brake2: bool, brake5: bool
-    ) -> tuple[float, float, float, float, float, float, float, float, int]:
-        parameters = self.parameters
-        return advance_five_bar(
-            state,
+        self._constants = (
             self._dynamics,
             self._settings,
             int(parameters.closure),
             parameters.singular_sine,
             self._step_s,
             parameters.substeps,
-            command2,
-            command5,
-            brake2,
-            brake5,
         )
+        # Compiled here rather than in the first servo period, where it would make a real-time host seconds late.
+        advance_five_bar(self._state.copy(), *self._constants, 0.0, 0.0, False, False)
 
     @property
     def axis_count(self) -> int:
@@ -421,10 +421,11 @@ class CoupledPlant:
         self._steps += 1
         if self._torn_at_s is not None:
             return
-        x2, x5, v2, v5, a2, a5, torque2, torque5, torn = self._run(
-            self._state, torque_commands_Nm[0], torque_commands_Nm[1], brakes_engaged[0], brakes_engaged[1]
-        )
-        self._values = (x2, x5, v2, v5, a2, a5, torque2, torque5)
+        command2, command5 = torque_commands_Nm
+        brake2, brake5 = brakes_engaged
+        after = advance_five_bar(self._state, *self._constants, command2, command5, brake2, brake5)
+        self._values = after[:8]
+        torn = after[8]
         if torn:
             self._torn_at_s = (self._steps - 1) * SERVO_PERIOD_S + torn * self._step_s
 
