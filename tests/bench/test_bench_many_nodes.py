@@ -10,6 +10,8 @@ from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
 from sim_drive.assembly import free_machine
+from sim_drive.faults import Fault, FaultKind
+from sim_drive.injector import Injector
 
 pytestmark = pytest.mark.bench
 
@@ -24,7 +26,8 @@ CONFIGURATION_NS = 2 * MS
 class Master:
     """Configures TPDO 1 of every node to every SYNC, its heartbeat to 100 ms, starts all, then sends SYNCs."""
 
-    def __init__(self, node_ids: range) -> None:
+    def __init__(self, node_ids: range, sync_period_ns: int = SYNC_PERIOD_NS) -> None:
+        self.sync_period_ns = sync_period_ns
         self.requests: list[Frame] = []
         for node_id in node_ids:
             for index, subindex, size, value in (
@@ -51,7 +54,7 @@ class Master:
             self.due_ns += CONFIGURATION_NS
         else:
             self.out.append(Frame(0x080))
-            self.due_ns += SYNC_PERIOD_NS
+            self.due_ns += self.sync_period_ns
 
     def take_frames(self) -> list[Frame]:
         frames, self.out = self.out, []
@@ -88,3 +91,21 @@ def test_many_nodes_with_heartbeat_and_synchronous_pdos(nodes: int) -> None:
     assert seen[0x180] == pytest.approx(nodes * 100, rel=0.02)
     assert seen[0x700] == pytest.approx(nodes * 10, rel=0.02)
     print(f"\n{nodes} nodes: {sum(seen.values())} frames, {1 / spent_s:.2f} machine seconds a second of CPU")
+
+
+@pytest.mark.parametrize("faults", [0, 1, 100])
+def test_what_faults_cost(faults: int) -> None:
+    """Two drives with SYNC at 1 kHz: bare, and with faults that concern frames which never come."""
+    node_ids = range(1, 3)
+    spent: list[float] = []
+    for _ in range(3):
+        master = Master(node_ids, MS)
+        machine = free_machine(node_ids)
+        idle = [Fault(FaultKind.LOST_FRAMES, 1, cob_id=0x7F0)] * faults
+        node = Injector(machine, idle) if faults else machine
+        bus = VirtualBus([master, node], 1_000_000)
+        bus.run_until(SECOND // 10)
+        begin = time.process_time()
+        bus.run_until(SECOND // 10 + SECOND)
+        spent.append(time.process_time() - begin)
+    print(f"\n{faults} idle faults: {min(spent) * 1e3:.1f} us of CPU a cycle")
