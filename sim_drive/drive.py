@@ -10,11 +10,10 @@ from drivers.frame import Frame
 from drivers.nmt import HEARTBEAT_BASE, MAX_NODE_ID, NMT_COB_ID, NmtCommand, NmtState
 from drivers.node import Event
 from drivers.object_dictionary import ObjectDictionary
-from drivers.sdo import SDO_REQUEST_BASE, AbortCode, ClientCommand
-from sim_drive.axis import Axis, Latch, SetPointSource
+from drivers.sdo import SDO_REQUEST_BASE, ClientCommand
+from sim_drive.axis import Axis, Latch
 from sim_drive.cam_slots import CamDecoder, CamSlots
 from sim_drive.cia402 import Mode, PowerState
-from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.heartbeat import HeartbeatConsumer, HeartbeatProducer
@@ -22,14 +21,11 @@ from sim_drive.lss_slave import LSS_REQUEST_COB_ID, UNCONFIGURED_NODE_ID, LssHoo
 from sim_drive.nmt_slave import next_state, parse_command
 from sim_drive.node_guarding import NodeGuard
 from sim_drive.parameters import MemoryParameterStore, ParameterMemory, ParametersLost, ParameterStore
-from sim_drive.pdo_slave import ReceivePdo, TransmitPdo
+from sim_drive.pdo_exchange import PDO_COUNT, FrameHandler, PdoExchange, RequestHandler
 from sim_drive.quirks import apply_quirks
 from sim_drive.sdo_server import SdoServer
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.time_of_day import TimeConsumer, TimeOfDay
-
-PDO_COUNT: Final = 4
-"""RPDOs and TPDOs that the drive has, each."""
 
 __all__ = [
     "PDO_COUNT",
@@ -43,9 +39,6 @@ __all__ = [
 ]
 
 _NS_PER_S: Final = 1_000_000_000
-_NS_PER_US: Final = 1_000
-_RESERVED_COUNTER_OVERFLOW: Final = 1
-_SYNC_GENERATE: Final = 1 << 30
 _LAST_COMMUNICATION_INDEX: Final = 0x1FFF
 _LAST_INDEX: Final = 0xFFFF
 
@@ -58,15 +51,8 @@ _COMMUNICATION_ERRORS: Final = (
 )
 """Errors whose cause ends with a reset, because what noticed them starts anew."""
 
-# Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
-_OPERATIONAL: Final = NmtState.OPERATIONAL
-_SDO: Final = SetPointSource.SDO
-_SYNC: Final = SetPointSource.SYNC
-
 _BLOCK_COMMANDS: Final = frozenset({int(ClientCommand.BLOCK_DOWNLOAD), int(ClientCommand.BLOCK_UPLOAD)})
 _UNKNOWN_COMMAND: Final = 0xE0
-_Handler = Callable[[bytes, int], None]
-_RequestHandler = Callable[[int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,29 +134,15 @@ class Drive:
         self._guard = NodeGuard(node_id, self.dictionary, self.outbox, self._on_guard_change)
         self._time = TimeConsumer(self.dictionary, self._subscribe)
         self._emergency.on_held_back = self._expect_wake
-        self._rpdos = [
-            ReceivePdo(number, self.dictionary, self.axis, self._emergency, self._on_pdo_change)
-            for number in range(1, PDO_COUNT + 1)
-        ]
-        self._tpdos = [
-            TransmitPdo(number, self.dictionary, self.axis, self.outbox, self._on_pdo_change)
-            for number in range(1, PDO_COUNT + 1)
-        ]
-        self._sync_rpdos: tuple[ReceivePdo, ...] = ()
-        self._sync_tpdos: tuple[TransmitPdo, ...] = ()
-        self._event_tpdos: tuple[TransmitPdo, ...] = ()
-        self._waiting_tpdos: tuple[TransmitPdo, ...] = ()
-        """Synchronous TPDOs whose SYNC start value has not come yet."""
-        self._monitored_rpdos: tuple[ReceivePdo, ...] = ()
-        self._sync_cob_id = self.dictionary.entry(objects.COB_ID_SYNC)
-        self._sync_cob_id.on_write = self._on_sync_cob_id
-        self._sync_period = self.dictionary.entry(objects.COMMUNICATION_CYCLE_PERIOD)
-        self._counter_overflow = self.dictionary.entry(objects.SYNCHRONOUS_COUNTER_OVERFLOW)
-        self._counter_overflow.on_write = self._on_counter_overflow
-        self._sync_window = self.dictionary.entry(objects.SYNCHRONOUS_WINDOW_LENGTH)
-        self._sync_window.on_write = self._on_sync_window
-        self._sync_at_ns: int | None = None
-        """The last SYNC, noted while there is a synchronous window; None before the first."""
+        self._pdos = PdoExchange(
+            self.dictionary,
+            self.axis,
+            self.outbox,
+            self._emergency,
+            self._subscribe,
+            self._expect_wake,
+            acts_on_receipt=Quirk.RPDO_ACTS_ON_RECEIPT in settings.quirks,
+        )
         self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
         self._memory = ParameterMemory(self.dictionary, store or MemoryParameterStore(), self._on_parameters_saved)
         hooks = LssHooks(self._memory.save_layer_settings, self._on_lss_waiting, self._on_bit_timing)
@@ -179,8 +151,8 @@ class Drive:
             self._memory.apply(objects.DEVICE_TYPE, _LAST_INDEX)
             self.axis.restore()
 
-        self._handlers: dict[int, _Handler] = {}
-        self._request_handlers: dict[int, _RequestHandler] = {}
+        self._handlers: dict[int, FrameHandler] = {}
+        self._request_handlers: dict[int, RequestHandler] = {}
         """By the COB-ID of a remote frame."""
         self.nmt_state = NmtState.BOOT_UP
         self._boot_due_ns: int | None = 0
@@ -237,12 +209,7 @@ class Drive:
         self._guard.wake(now_ns)
         self._emergency.wake(now_ns)
         self._sdo.wake(now_ns)
-        if self.nmt_state is NmtState.OPERATIONAL:
-            for tpdo in self._event_tpdos:
-                tpdo.wake(now_ns)
-            for rpdo in self._monitored_rpdos:
-                if rpdo.deadline_ns is not None and now_ns >= rpdo.deadline_ns:
-                    self._miss(rpdo, now_ns)
+        self._pdos.wake(now_ns)
         self._producer.wake(now_ns, self.nmt_state)
 
     def take_frames(self) -> list[Frame]:
@@ -266,11 +233,8 @@ class Drive:
             return self._boot_due_ns
         if self.node_id == UNCONFIGURED_NODE_ID:
             return None
-        timers = (self._consumer, self._guard, self._emergency, self._sdo, self._producer)
+        timers = (self._consumer, self._guard, self._emergency, self._sdo, self._pdos, self._producer)
         dues = [timer.next_wake_ns() for timer in timers]
-        if self.nmt_state is NmtState.OPERATIONAL:
-            dues += [tpdo.due_ns for tpdo in self._event_tpdos]
-            dues += [rpdo.deadline_ns for rpdo in self._monitored_rpdos]
         return min((due for due in dues if due is not None), default=None)
 
     # -- what the machine uses -----------------------------------------------------------------------------------
@@ -290,10 +254,8 @@ class Drive:
             self.axis.shaft_counts = shaft_counts
             return
         self.axis.on_tick(now_ns, shaft_counts)
-        if self._event_tpdos and self.nmt_state is _OPERATIONAL:
-            for tpdo in self._event_tpdos:
-                if tpdo.poll(now_ns):
-                    self._is_wake_stale = True
+        if self._pdos.event_tpdos and self._pdos.is_operational:
+            self._pdos.poll(now_ns)
 
     @property
     def position_demand_counts(self) -> float:
@@ -439,12 +401,11 @@ class Drive:
             self._handlers = {LSS_REQUEST_COB_ID: self._on_lss}
             self.subscriptions_changed = True
             return
-        for pdo in (*self._rpdos, *self._tpdos):
-            pdo.restore(now_ns)
+        self._pdos.restore(now_ns)
         self._producer.restore(now_ns)
         self._consumer.restore()
         self._guard.restore()
-        self._on_pdo_change(now_ns)
+        self._pdos.rearrange(now_ns)
         self._producer.send_boot_up()
         if Quirk.NO_BOOT_UP in self.settings.quirks:
             self.outbox.pop()
@@ -489,125 +450,28 @@ class Drive:
         self.events.append(NmtStateChanged(now_ns, self.node_id, state))
         self._emergency.is_silent = state in {NmtState.STOPPED, NmtState.BOOT_UP}
         self._sdo.reset()
-        self._sync_at_ns = None
-        for rpdo in self._rpdos:
-            rpdo.forget()
-        if state is NmtState.OPERATIONAL:
-            for tpdo in self._tpdos:
-                if tpdo.is_valid:
-                    tpdo.begin(now_ns)
-            self._sort_synchronous_tpdos()
+        self._pdos.enter(state is NmtState.OPERATIONAL, now_ns)
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
-    def _on_pdo_change(self, now_ns: int) -> None:
-        self._sort_synchronous_tpdos()
-        self._event_tpdos = tuple(tpdo for tpdo in self._tpdos if _is_used(tpdo) and tpdo.is_event_driven)
-        self._monitored_rpdos = tuple(rpdo for rpdo in self._rpdos if _is_used(rpdo) and rpdo.event_ns)
-        if not any(rpdo.is_late for rpdo in self._rpdos):
-            self._emergency.end_cause(EmergencyCode.RPDO_TIMEOUT, now_ns)
-        self._sync_rpdos = tuple(rpdo for rpdo in self._rpdos if _is_used(rpdo) and rpdo.is_synchronous)
-        self._subscribe()
-
-    def _sort_synchronous_tpdos(self) -> None:
-        """Part the synchronous TPDOs in those that a SYNC concerns, and those that wait for their first one."""
-        synchronous = [tpdo for tpdo in self._tpdos if _is_used(tpdo) and tpdo.is_synchronous]
-        has_counter = bool(self._counter_overflow.value)
-        waiting = [tpdo for tpdo in synchronous if has_counter and tpdo.sync_start_value and not tpdo.has_started]
-        self._waiting_tpdos = tuple(waiting)
-        self._sync_tpdos = tuple(tpdo for tpdo in synchronous if tpdo not in waiting)
-
     def _subscribe(self) -> None:
-        handlers: dict[int, _Handler] = {}
-        for rpdo in self._rpdos:
-            if _is_used(rpdo):
-                _add(handlers, rpdo.cob_id, self._rpdo_handler(rpdo))
+        handlers: dict[int, FrameHandler] = {}
+        for cob_id, handler in self._pdos.handlers():
+            _add(handlers, cob_id, handler)
         for node_id in self._consumer.node_ids:
             _add(handlers, HEARTBEAT_BASE + node_id, self._heartbeat_handler(node_id))
-        is_plain = not self._counter_overflow.value and not self._sync_window.value
-        _add(handlers, self._sync_cob_id.value & COB_ID_MASK, self._on_sync if is_plain else self._on_noted_sync)
         if self._time.cob_id is not None:
             _add(handlers, self._time.cob_id, self._on_time)
         _add(handlers, LSS_REQUEST_COB_ID, self._on_lss)
         _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
         _add(handlers, NMT_COB_ID, self._on_nmt)
         self._handlers = handlers
-        self._request_handlers = {
-            tpdo.cob_id: self._request_handler(tpdo)
-            for tpdo in self._tpdos
-            if _is_used(tpdo) and tpdo.is_sent_on_request
-        }
+        self._request_handlers = self._pdos.request_handlers()
         self._request_handlers[HEARTBEAT_BASE + self.node_id] = self._on_guard_request
         self._is_wake_stale = True
         self.subscriptions_changed = True
 
-    def _rpdo_handler(self, rpdo: ReceivePdo) -> _Handler:
-        receive = rpdo.receive
-        window_ns = self._sync_window.value * _NS_PER_US if rpdo.is_synchronous else 0
-        if window_ns or rpdo.event_ns:
-            return self._guarded_rpdo_handler(rpdo, window_ns)
-        if rpdo.is_synchronous and Quirk.RPDO_ACTS_ON_RECEIPT in self.settings.quirks:
-            return self._hasty_rpdo_handler(rpdo)
-
-        def handle(data: bytes, now_ns: int) -> None:
-            if self.nmt_state is _OPERATIONAL:
-                receive(data, now_ns)
-
-        return handle
-
-    def _hasty_rpdo_handler(self, rpdo: ReceivePdo) -> _Handler:
-        """A synchronous RPDO acts without waiting for the SYNC, as if one had come with it."""
-
-        def handle(data: bytes, now_ns: int) -> None:
-            if self.nmt_state is not _OPERATIONAL:
-                return
-            rpdo.receive(data, now_ns)
-            pending = rpdo.pending
-            if pending is not None:
-                rpdo.pending = None
-                self.axis.source = _SYNC
-                rpdo.apply(pending, now_ns)
-                self.axis.on_sync(now_ns)
-                self.axis.source = _SDO
-
-        return handle
-
-    def _guarded_rpdo_handler(self, rpdo: ReceivePdo, window_ns: int) -> _Handler:
-        """With synchronous window (0: none) or event timer.
-
-        What comes later after a SYNC than the window is long is not used (CiA 301, 7.5.2.8). No EMCY tells of it: the
-        standard leaves that open, and has no code for it.
-        """
-
-        def handle(data: bytes, now_ns: int) -> None:
-            if self.nmt_state is not _OPERATIONAL:
-                return
-            if rpdo.event_ns:
-                rpdo.note_arrival(data, now_ns)
-                self._is_wake_stale = True
-                if not any(other.is_late for other in self._rpdos):
-                    self._emergency.end_cause(EmergencyCode.RPDO_TIMEOUT, now_ns)
-            if not window_ns or self._sync_at_ns is None or now_ns - self._sync_at_ns <= window_ns:
-                rpdo.receive(data, now_ns)
-
-        return handle
-
-    def _miss(self, rpdo: ReceivePdo, now_ns: int) -> None:
-        """An RPDO has not come within its event time."""
-        rpdo.deadline_ns = None
-        rpdo.is_late = True
-        self._emergency.raise_error(
-            EmergencyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
-        )
-
-    def _request_handler(self, tpdo: TransmitPdo) -> _RequestHandler:
-        def handle(now_ns: int) -> None:
-            if self.nmt_state is _OPERATIONAL:
-                tpdo.on_request(now_ns)
-
-        return handle
-
-    def _heartbeat_handler(self, node_id: int) -> _Handler:
+    def _heartbeat_handler(self, node_id: int) -> FrameHandler:
         def handle(data: bytes, now_ns: int) -> None:
             self._is_wake_stale = True
             self._consumer.receive(node_id, data, now_ns)
@@ -644,71 +508,6 @@ class Drive:
                 data = bytes((_UNKNOWN_COMMAND, *data[1:]))
             self._sdo.receive(data, now_ns)
 
-    # -- SYNC ----------------------------------------------------------------------------------------------------
-
-    def _on_sync(self, data: bytes, now_ns: int) -> None:
-        """Sample and send first, then let the demands act that came before this SYNC."""
-        if self.nmt_state is not _OPERATIONAL:
-            return
-        if data:
-            self._refuse_sync(now_ns)
-            return
-        if self._emergency.has_errors:
-            self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
-        axis = self.axis
-        axis.sample(now_ns)
-        for tpdo in self._sync_tpdos:
-            tpdo.on_sync(now_ns)
-        axis.source = _SYNC
-        for rpdo in self._sync_rpdos:
-            pending = rpdo.pending
-            if pending is not None:
-                rpdo.pending = None
-                rpdo.apply(pending, now_ns)
-        axis.on_sync(now_ns)
-        axis.source = _SDO
-
-    def _on_noted_sync(self, data: bytes, now_ns: int) -> None:
-        """A SYNC with counter, or with a synchronous window after it."""
-        if self.nmt_state is not _OPERATIONAL:
-            return
-        if len(data) != (1 if self._counter_overflow.value else 0):
-            self._refuse_sync(now_ns)
-            return
-        self._sync_at_ns = now_ns
-        if data and self._waiting_tpdos:
-            for tpdo in self._waiting_tpdos:
-                tpdo.has_started = data[0] == tpdo.sync_start_value
-            self._sort_synchronous_tpdos()
-        self._on_sync(b"", now_ns)
-
-    def _refuse_sync(self, now_ns: int) -> None:
-        self._emergency.raise_error(
-            EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=False
-        )
-
-    def _on_counter_overflow(self, value: int, now_ns: int) -> AbortCode | None:
-        if value == _RESERVED_COUNTER_OVERFLOW:
-            return AbortCode.VALUE_RANGE_EXCEEDED
-        if self._sync_period.value:
-            return AbortCode.CANNOT_STORE_DEVICE_STATE
-        self._counter_overflow.value = value
-        self._on_pdo_change(now_ns)
-        return None
-
-    def _on_sync_window(self, value: int, now_ns: int) -> AbortCode | None:
-        self._sync_window.value = value
-        self._sync_at_ns = None
-        self._subscribe()
-        return None
-
-    def _on_sync_cob_id(self, value: int, now_ns: int) -> AbortCode | None:
-        if value & (_SYNC_GENERATE | EXTENDED_FRAME) or is_restricted(value & COB_ID_MASK):
-            return AbortCode.VALUE_RANGE_EXCEEDED
-        self._sync_cob_id.value = value
-        self._subscribe()
-        return None
-
     # -- error control of the master, by heartbeat or guarding -------------------------------------------------------
 
     def _on_guard_change(self, is_lost: bool, now_ns: int) -> None:
@@ -724,12 +523,7 @@ class Drive:
             self._enter(NmtState.STOPPED, now_ns)
 
 
-def _is_used(pdo: ReceivePdo | TransmitPdo) -> bool:
-    """Whether a PDO is valid and carries something."""
-    return pdo.is_valid and bool(pdo.length)
-
-
-def _add(handlers: dict[int, _Handler], cob_id: int, handler: _Handler) -> None:
+def _add(handlers: dict[int, FrameHandler], cob_id: int, handler: FrameHandler) -> None:
     """Let ``handler`` take frames of ``cob_id``, after those that already do."""
     first = handlers.get(cob_id)
     if first is None:
