@@ -3,6 +3,7 @@
 import pytest
 from fault_line import Line
 
+from sim_drive.drive import Drive
 from sim_drive.faults import FAULTS, Direction, Fault, FaultKind
 from sim_drive.injector import FaultEnded, FaultStarted
 
@@ -128,6 +129,28 @@ def test_a_power_cycle_is_deaf_mute_and_forgetful_and_boots_at_its_end() -> None
     assert line.until(3.1) == ["705#00"]
     assert line.read(0x1017) == 0
     assert statusword(line) == 0x40
+
+
+def test_what_was_stored_outlives_a_power_cycle_and_nothing_else_does() -> None:
+    line = Line([Fault(FaultKind.POWER_CYCLE, NODE, at_s=1.0, for_s=0.5)])
+    line.until(0.1)
+    assert line.write(0x6065, 0, 1234, 4) == 0
+    assert line.write(0x1010, 1, 0x65766173, 4) == 0
+    assert line.write(0x6066, 0, 77, 2) == 0
+    usual = Line().machine.drives[0]
+    assert isinstance(usual, Drive)
+    line.until(1.6)
+    assert line.read(0x6065) == 1234
+    assert line.read(0x6066).to_bytes(2, "little") == usual.dictionary.read(0x6066, 0, 0)
+
+
+def test_a_drive_without_power_is_deaf_to_lss_too() -> None:
+    """LSS switch state global to configuration, then inquire node id: answered with supply, and only then."""
+    for faults, answers in (([], ["7E4#5E05000000000000"]), ([Fault(FaultKind.POWER_CYCLE, NODE, at_s=0.5)], [])):
+        line = Line(faults)
+        line.until(0.6)
+        line.put(0x7E5, "0401000000000000")
+        assert line.put(0x7E5, "5E00000000000000") == answers
 
 
 def test_power_lost_twice_at_once_comes_back_with_the_later_end() -> None:
