@@ -25,6 +25,7 @@ from drivers.ports import interface_is_up, open_port
 from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
 from mechanism.errors import MechanismError
 from sim_drive.faults import Fault, describe_faults
+from sim_drive.quirks import describe_quirks
 from sim_drive.scenario import Scenario, load_scenario, parse_fault
 from sim_drive.settings import DriveSettings
 from sim_drive.socketcand_server import SocketcandServer
@@ -48,7 +49,7 @@ _EPILOG: Final = """Examples:
   sim-drive paper --fault "servo over_current at_s=3" --fault "1 lost_frames cob_id=0x181 probability=0.01"
   sim-drive paper --scenario trouble.yaml    the same in a file, faults: [{node: servo, kind: over_current, at_s: 3}]
   sim-drive --list-faults                    every kind of fault, and what it takes
-  sim-drive paper --quirk slow_mode_switch   a habit of real drives, see --help; in CONFIG: emulation.quirks of an axis
+  sim-drive paper --quirk slow_mode_switch   a habit of real drives; in CONFIG: emulation.quirks of an axis
 
 Connect to it, over socketcand, with python-can:
 
@@ -113,6 +114,12 @@ class _Fleet:
     """Node ids by the names of their axes."""
 
 
+def _print_quirks(wanted: bool) -> None:
+    if wanted:
+        print(describe_quirks())
+        raise typer.Exit
+
+
 def _print_faults(wanted: bool) -> None:
     if wanted:
         print(describe_faults())
@@ -137,8 +144,11 @@ def sim_drive(
     ] = False,
     quirk: Annotated[
         list[Quirk] | None,
-        typer.Option(help="A habit of real drives that all have; may be given several times."),
+        typer.Option(metavar="NAME", help="A habit of real drives that all have; may be given several times."),
     ] = None,
+    list_quirks: Annotated[
+        bool, typer.Option("--list-quirks", help="List all habits and exit.", callback=_print_quirks, is_eager=True)
+    ] = False,
     interface: Annotated[
         str | None, typer.Option(help="auto, socketcan, socketcand or a python-can interface  [default: from CONFIG]")
     ] = None,
@@ -163,7 +173,7 @@ def sim_drive(
         bool, typer.Option("--realtime", help="Ask for SCHED_FIFO and locked memory, and say what was granted.")
     ] = False,
     as_json: Annotated[
-        bool, typer.Option("--json", help="Report on standard output, one JSON object a line: ready, then stopped.")
+        bool, typer.Option("--json", help="Report on standard output, one JSON object a line: ready, faults, stopped.")
     ] = False,
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log clients coming and going.")] = False,
 ) -> None:

@@ -89,6 +89,12 @@ def test_every_fault_is_listed() -> None:
     assert "delay_s" in done.stdout
 
 
+def test_every_quirk_is_listed() -> None:
+    done = run("--list-quirks")
+    assert done.returncode == 0
+    assert done.stdout.split() == [quirk.value for quirk in Quirk]
+
+
 def test_faults_of_a_file_and_of_the_command_line_happen_and_are_told(tmp_path: Path) -> None:
     scenario = tmp_path / "trouble.yaml"
     scenario.write_text("faults: [{kind: power_cycle, node: 3, at_s: 0.1, for_s: 0.05}]")
