@@ -1,4 +1,4 @@
-"""Services that a usual run does not show, as a candump log before tshark's CANopen dissector: no frame is malformed."""
+"""Services that a usual run does not show, as a candump log before tshark's CANopen dissector: none is malformed."""
 
 import re
 from collections.abc import Callable, Iterator
