@@ -19,6 +19,7 @@ DEVICE_STATE = 0x08000022
 REFUSED_NOW = {UNSUPPORTED_ACCESS, RANGE, DEVICE_STATE}
 CANNOT_STORE = {0x08000020, 0x08000021, 0x08000022}
 
+SAVE, LOAD = "73617665", "6C6F6164"
 START, STOP, PRE_OPERATIONAL = "000#0105", "000#0205", "000#8005"
 RESET_NODE, RESET_COMMUNICATION = "000#8105", "000#8205"
 DEVICE_TYPE = ("4000100000000000", "4300100092010200")
@@ -106,6 +107,18 @@ def test_row_02_no_tpdo_slips_out_after_the_state_has_changed(bus: Bus, state: s
     assert bus.run(2) == []
     assert bus.send(STOP if state == "stopped" else PRE_OPERATIONAL) == []
     assert bus.run(1000) == []
+
+
+def test_row_02_no_emergency_slips_out_after_the_state_has_changed(bus: Bus):
+    bus.done("2B151000E8030000")  # inhibit time 100 ms
+    assert bus.trip() == ["085#1023030000000000"]
+    assert bus.trip(0x3210, 0x04) == []  # waits
+    bus.send(STOP)
+    assert bus.run(1000) == []
+    assert bus.trip(0x4310, 0x08) == []
+    bus.send(PRE_OPERATIONAL)
+    assert bus.run(1000) == []
+    assert bus.value("031000") == 3
 
 
 def test_row_02_a_transfer_does_not_outlive_stopped(bus: Bus):
@@ -564,6 +577,50 @@ def test_row_15_several_nodes_are_watched_each_for_itself(bus: Bus):
     assert bus.send("77E#05") == ["085#0000000000000000"]
 
 
+def test_row_15_after_its_own_reset_the_consumer_waits_for_the_first_heartbeat_again(bus: Bus):
+    watch(bus)
+    bus.done("23101001" + SAVE)
+    bus.send("77F#05")
+    bus.run(50)
+    for reset in (RESET_NODE, RESET_COMMUNICATION):
+        assert bus.send(reset) == ["705#00"]
+        assert bus.run(1000) == []
+        assert bus.sdo("4016100100000000") == "4316100164007F00"
+        bus.send("77F#05")
+        assert bus.run(101) == ["085#3081110000000000"]
+        bus.send("77F#05")
+
+
+def test_row_15_one_node_is_not_watched_twice(bus: Bus):
+    watch(bus)
+    assert bus.abort("2316100232007F00") == 0x06040043
+    # A node id or a time of 0 watches nobody, and 128 and more are no nodes.
+    bus.done("2316100264000000", "2316100300007E00")
+    assert bus.abort("2316100464008000") in {RANGE, 0x06090031, 0x06040043}
+    bus.send("77E#05")
+    bus.send("700#05")
+    assert bus.run(1000) == []
+
+
+def test_row_15_node_guarding_toggles_and_life_guarding_is_a_loss(bus: Bus):
+    assert [bus.send("705#R") for _ in range(3)] == [["705#7F"], ["705#FF"], ["705#7F"]]
+    bus.send(START)
+    assert bus.send("705#R") == ["705#85"]
+    # The boot-up starts the toggle anew.
+    bus.send(RESET_COMMUNICATION)
+    assert bus.send("705#R") == ["705#7F"]
+    # 100 ms times 3: no loss before the first request, and one after 300 ms without any.
+    bus.done("2B0C100064000000", "2F0D100003000000")
+    assert bus.run(1000) == []
+    assert bus.send("705#R") == ["705#FF"]
+    assert bus.run(299) == []
+    assert bus.run(2) == ["085#3081110000000000"]
+    # With a heartbeat of its own the node is not guarded.
+    bus.send(RESET_COMMUNICATION)
+    bus.done("2B171000E8030000")
+    assert bus.send("705#R") == []
+
+
 # -- row 16: EMCY ------------------------------------------------------------------------------------------------------
 
 
@@ -630,8 +687,6 @@ def test_row_16_cob_id_of_emergencies(bus: Bus):
 
 
 # -- row 17: store and restore -----------------------------------------------------------------------------------------
-
-SAVE, LOAD = "73617665", "6C6F6164"
 
 
 @pytest.mark.parametrize("place", ["101001", "101002", "111001", "111002"])

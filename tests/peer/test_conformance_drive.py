@@ -1,5 +1,6 @@
 """Conformance of the emulated drive as a CiA 402 device, rows 18 to 27: every byte written out by hand."""
 
+from itertools import pairwise
 from math import inf
 
 import pytest
@@ -10,6 +11,8 @@ from sim_drive.settings import DriveSettings
 from sim_drive.switches import Switches
 
 RANGE = 0x06090030
+CANNOT = {0x08000020, 0x08000021, 0x08000022, 0x05040005}
+"""Not now: device state, local control, no memory."""
 START, STOP, PRE_OPERATIONAL, RESET_NODE = "000#0105", "000#0205", "000#8005", "000#8105"
 
 # Statusword mask and value of every state, as the standard's table has them.
@@ -29,6 +32,11 @@ TARGET_REACHED, LIMIT, BIT_12, BIT_13 = 0x0400, 0x0800, 0x1000, 0x2000
 @pytest.fixture
 def bus() -> Bus:
     return Bus()
+
+
+def code_of(answer: str) -> int:
+    assert answer[:2] == "80", answer
+    return int.from_bytes(bytes.fromhex(answer[8:]), "little")
 
 
 def state_of(statusword: int) -> str:
@@ -427,8 +435,6 @@ def test_row_21_abort_connection_option(bus: Bus, option: int, loss: str):
     assert (abs(velocity(bus)) > 15_000) is (option == 0)
 
 
-NOT_YET_7 = pytest.param("07", marks=pytest.mark.xfail(strict=False, reason="interpolated position is not there yet"))
-
 # -- row 22: modes -----------------------------------------------------------------------------------------------------
 
 
@@ -459,7 +465,7 @@ def test_row_22_supported_modes_are_those_that_can_be_set(bus: Bus):
             assert answer[:2] == "80" or answer == "6060600000000000"
 
 
-@pytest.mark.parametrize("mode", ["01", "03", "04", "06", NOT_YET_7, "08", "09", "0A"])
+@pytest.mark.parametrize("mode", ["01", "03", "04", "06", "07", "08", "09", "0A"])
 def test_row_22_the_standards_modes_are_supported(bus: Bus, mode: str):
     assert bus.value("026500") >> (int(mode, 16) - 1) & 1
     bus.done(f"2F606000{mode}000000")
@@ -711,7 +717,27 @@ def test_row_24_cst_adds_the_torque_offset(bus: Bus):
     assert bus.value("776000", signed=True) == pytest.approx(50, abs=3)
 
 
-@pytest.mark.parametrize(("mode", "entry", "first"), [("08", "20007A60", "0A000000"), ("09", "2000FF60", "E8030000")])
+def test_row_24_csp_goes_in_a_straight_line_over_the_interpolation_time(bus: Bus):
+    """60C2h is 20 ms: half of the way after 10 ms; without a successor the line goes on no longer than once more."""
+    bus.done("2FC2600114000000", "2FC26002FD000000")
+    cyclic(bus, "08", "20007A60")
+    for number in range(1, 6):
+        bus.send("205#0F00" + i32(200 * number))
+        bus.send("080#")
+        bus.run(10)
+        assert demand(bus) == pytest.approx(200 * number - 100, abs=2)
+        bus.run(10)
+        assert demand(bus) == pytest.approx(200 * number, abs=2)
+    bus.run(20)
+    assert 1000 <= demand(bus) <= 1200
+    held = demand(bus)
+    bus.run(30)
+    assert demand(bus) == held
+
+
+@pytest.mark.parametrize(
+    ("mode", "entry", "first"), [("08", "20007A60", ""), ("09", "2000FF60", "E8030000"), ("0A", "10007160", "0A00")]
+)
 def test_row_24_missing_set_points_end_in_a_fault(bus: Bus, mode: str, entry: str, first: str):
     """Held or extrapolated for a while, and not for ever; no jump."""
     cyclic(bus, mode, entry)
@@ -751,6 +777,48 @@ def test_row_24_positions_wrap_in_whole_counts(bus: Bus):
     assert demand(bus) == 0x7FFFFF00 + 1000 - 2**32
     assert position(bus) == pytest.approx(0x7FFFFF00 + 1000 - 2**32, abs=8)
     assert state(bus) == "operation enabled"
+
+
+def test_row_24_interpolated_position_by_the_buffer(bus: Bus):
+    """Writing 60C1h:01 commits a record; bit 4 enables, bit 12 tells; one record every 60C2h, 10 ms, in order."""
+    assert bus.sdo("40C0600000000000") == "4BC0600000000000"  # linear
+    bus.done("2FC260010A000000", "2FC26002FD000000", "2FC4600600000000", "2FC4600601000000")
+    bus.enable("07")
+    assert not bus.statusword & BIT_12
+    size = bus.value("C46001")
+    assert size >= 4
+    for number in range(1, 5):
+        bus.done("23C16001" + i32(50 * number))
+    bus.run(50)
+    assert demand(bus) == 0  # not enabled yet
+    control(bus, 0x1F)
+    bus.run(3)
+    assert bus.statusword & BIT_12
+    ways = [demand(bus)]
+    for _ in range(80):
+        bus.run(1)
+        ways.append(demand(bus))
+    assert ways[-1] == 200
+    assert all(0 <= b - a <= 7 for a, b in pairwise(ways))
+    moving_ms = sum(b > a for a, b in pairwise(ways))
+    assert 36 <= moving_ms <= 43  # 4 records, 3 of the first 40 ms have passed
+    assert state(bus) == "operation enabled"
+    control(bus, 0x0F)
+    assert not bus.statusword & BIT_12
+
+
+def test_row_24_the_interpolation_buffer_has_an_end_and_is_cleared(bus: Bus):
+    bus.done("2FC260010A000000", "2FC4600600000000")
+    # Cleared and disabled: nothing is taken.
+    assert code_of(bus.sdo("23C1600164000000")) in CANNOT
+    bus.done("2FC4600601000000")
+    bus.enable("07")
+    size = bus.value("C46001")
+    for number in range(size):
+        bus.done("23C16001" + i32(number))
+    assert code_of(bus.sdo("23C1600164000000")) in CANNOT
+    bus.done("2FC4600600000000", "2FC4600601000000", "23C1600164000000")
+    assert bus.value("616000") == 7
 
 
 # -- row 25: following error -------------------------------------------------------------------------------------------

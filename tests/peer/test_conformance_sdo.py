@@ -123,7 +123,6 @@ def test_row_06_read_only_is_refused_at_the_initiate(bus: Bus, place: str, form:
     assert is_alive(bus)
 
 
-@pytest.mark.xfail(strict=False, reason="interpolated position mode, 60C4h, is not there yet")
 @pytest.mark.parametrize("place", ["C46005", "C46006"])
 @pytest.mark.parametrize("form", ["40{}00000000", "A4{}7F000000"])
 def test_row_06_write_only_is_refused_at_the_initiate(bus: Bus, place: str, form: str):
