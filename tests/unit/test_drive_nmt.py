@@ -125,21 +125,6 @@ def test_reset_node_restores_everything_but_the_slots(bench: Bench):
     assert bench.read(0x3001, 6) == 7
 
 
-def test_every_default_of_the_eds_is_what_is_read_after_a_reset(bench: Bench):
-    bench.nmt(0x81)
-    live = {0x6041, 0x6061}
-    for variable in bench.drive.dictionary.description:
-        if variable.index < 0x1000 or variable.index in live or variable.size is None:
-            continue
-        place = (variable.index, variable.subindex)
-        if variable.index == 0x1003 and variable.subindex:
-            assert bench.read_abort(*place) == 0x08000024
-        else:
-            assert bench.read(*place, signed=isinstance(variable.default, int) and variable.default < 0) == (
-                variable.default
-            ), variable
-
-
 # -- heartbeats --------------------------------------------------------------------------------------------------------
 
 

@@ -46,7 +46,7 @@ def test_variables_carry_type_access_limits_and_mapping():
     assert dictionary.object_code(0x6041) is ObjectCode.VARIABLE
     assert dictionary.name(0x6041) == "Statusword"
     assert dictionary.get(0x6041, 1) is None
-    assert 0x6099 not in dictionary
+    assert 0x5FFF not in dictionary
 
 
 def test_dummy_types_may_be_mapped():
