@@ -43,7 +43,14 @@ VOLATILE_OBJECTS: Final = frozenset(
         objects.MODES_OF_OPERATION,
         objects.TARGET_POSITION,
         objects.TARGET_TORQUE,
+        objects.TARGET_VELOCITY,
+        objects.POSITION_OFFSET,
+        objects.VELOCITY_OFFSET,
         objects.TORQUE_OFFSET,
+        objects.TOUCH_PROBE_FUNCTION,
+        objects.INTERPOLATION_DATA_RECORD,
+        objects.INTERPOLATION_DATA_CONFIGURATION,
+        objects.DIGITAL_OUTPUTS,
         objects.CAM_MASTER_POSITION,
         objects.PROFILE_SLOT_SELECTED,
         *range(objects.PROFILE_SLOT, objects.PROFILE_SLOT + objects.PROFILE_SLOT_COUNT),
@@ -212,6 +219,7 @@ def is_storable(entry: Entry) -> bool:
     variable = entry.variable
     return (
         variable.access.is_writable
+        and variable.access.is_readable
         and variable.size is not None
         and variable.index >= objects.DEVICE_TYPE
         and variable.index not in VOLATILE_OBJECTS

@@ -182,12 +182,24 @@ def test_commands_and_demands_are_no_parameters(bench: StoringBench):
     bench.must(0x3010, 0, 2, 1)
     bench.enable()
     bench.must(0x607A, 0, 5000, 4)
+    bench.must(0x60FF, 0, 5000, 4)
+    bench.must(0x60B0, 0, 5, 4)
     bench.drive.warn(0x2310, 0x02, bench.now_ns)
     save(bench)
     bench.power_cycle()
     bench.tick()
     assert bench.statusword & 0x6F == 0x40
-    assert [bench.read(index) for index in (0x6040, 0x6060, 0x607A, 0x3010, 0x1003)] == [0, 0, 0, 0, 0]
+    assert [bench.read(index) for index in (0x6040, 0x6060, 0x607A, 0x60FF, 0x60B0, 0x3010, 0x1003)] == [0] * 7
+
+
+def test_saving_the_defaults_changes_nothing(bench: StoringBench):
+    bench.tick()
+    before = {(e.variable.index, e.variable.subindex): e.value for e in bench.drive.dictionary}
+    save(bench)
+    assert len(bench._store.load().values) > 150
+    bench.power_cycle()
+    bench.tick()
+    assert {(e.variable.index, e.variable.subindex): e.value for e in bench.drive.dictionary} == before
 
 
 def test_identity_and_settings_stay_the_drives_own(bench: StoringBench):
