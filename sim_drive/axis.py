@@ -102,7 +102,6 @@ class Axis(Motion):
         "_idle_controlword",
         "_interpolation_exponent",
         "_interpolation_value",
-        "_max_torque",
         "_mode",
         "_mode_display",
         "_mode_entry",
@@ -116,12 +115,15 @@ class Axis(Motion):
         "_statusword",
         "_ticking",
         "_torque_actual",
+        "_torque_limits",
         "_torque_offset",
         "_velocity_actual",
         "gains",
         "is_powered",
+        "negative_torque_limit_Nm",
         "on_sync",
         "position_demand_counts",
+        "torque_limit_Nm",
     )
 
     def __init__(
@@ -154,7 +156,15 @@ class Axis(Motion):
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
         self._interpolation_exponent = entry(objects.INTERPOLATION_TIME_PERIOD, 2)
-        self._max_torque = entry(objects.MAX_TORQUE)
+        self._torque_limits = (
+            entry(objects.MAX_TORQUE),
+            entry(objects.POSITIVE_TORQUE_LIMIT),
+            entry(objects.NEGATIVE_TORQUE_LIMIT),
+        )
+        self.torque_limit_Nm = 0.0
+        """What max torque 6072h and the positive torque limit 60E0h allow."""
+        self.negative_torque_limit_Nm = 0.0
+        """What 6072h and 60E1h allow in the negative direction, as a positive number."""
         self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
         self._rated_torque_Nm = settings.rated_torque_Nm
         self._has_switches = bool(settings.switches.fitted)
@@ -226,6 +236,8 @@ class Axis(Motion):
         self._mode_entry.on_write = self._on_mode
         self._interpolation_value.on_write = self._on_interpolation_value
         self._interpolation_exponent.on_write = self._on_interpolation_exponent
+        for place, entry in enumerate(self._torque_limits):
+            entry.on_write = self._torque_limit_writer(place)
         for place, entry in enumerate(self._gain_entries):
             entry.on_write = self._gain_writer(place)
         for entry in (
@@ -269,6 +281,7 @@ class Axis(Motion):
         self._following_error_since_ns = None
         self._sampled_at_ns = -1
         self.gains = tuple(entry.value for entry in self._gain_entries)
+        self._limit_torque(*(entry.value for entry in self._torque_limits))
         self.set_period(self._interpolation_value.value, self._interpolation_exponent.value)
         self.demand.hold(float(self.shaft_counts))
         self.show_status()
@@ -304,17 +317,26 @@ class Axis(Motion):
 
     @property
     def torque_demand_Nm(self) -> float | None:  # noqa: N802 - the unit is part of the name
-        """Torque that a torque mode asks for, within max torque 6072h; None where the position controller decides."""
+        """Torque that a torque mode asks for, within its limits; None where the position controller decides."""
         demand = self.torque_demand
         if demand is None or not self.is_powered:
             return None
-        bound = float(self._max_torque.value)
-        return max(-bound, min(bound, demand)) * 0.001 * self._rated_torque_Nm
+        torque = demand * 0.001 * self._rated_torque_Nm
+        return max(-self.negative_torque_limit_Nm, min(self.torque_limit_Nm, torque))
 
-    @property
-    def torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
-        """Max torque 6072h."""
-        return self._max_torque.value * 0.001 * self._rated_torque_Nm
+    def _limit_torque(self, maximum: int, positive: int, negative: int) -> None:
+        permille_Nm = 0.001 * self._rated_torque_Nm
+        self.torque_limit_Nm = min(maximum, positive) * permille_Nm
+        self.negative_torque_limit_Nm = min(maximum, negative) * permille_Nm
+
+    def _torque_limit_writer(self, place: int) -> Callable[[int, int], AbortCode | None]:
+        def write(value: int, now_ns: int) -> AbortCode | None:
+            bounds: list[int] = [entry.value for entry in self._torque_limits]
+            bounds[place] = value
+            self._limit_torque(*bounds)
+            return None
+
+        return write
 
     # -- the servo tick ------------------------------------------------------------------------------------------
 

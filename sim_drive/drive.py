@@ -274,8 +274,13 @@ class Drive:
 
     @property
     def torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
-        """Max torque 6072h: what the amplifier may give at most."""
+        """What max torque 6072h and the positive torque limit 60E0h allow."""
         return self.axis.torque_limit_Nm
+
+    @property
+    def negative_torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
+        """What 6072h and 60E1h allow in the negative direction, as a positive number."""
+        return self.axis.negative_torque_limit_Nm
 
     @property
     def is_powered(self) -> bool:

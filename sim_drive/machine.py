@@ -66,6 +66,8 @@ class MachineDrive(Protocol):
     @property
     def torque_limit_Nm(self) -> float: ...  # noqa: N802
     @property
+    def negative_torque_limit_Nm(self) -> float: ...  # noqa: N802
+    @property
     def is_powered(self) -> bool: ...
     @property
     def brake_released(self) -> bool: ...
@@ -429,6 +431,7 @@ class EmulatedMachine:
                         drive.torque_offset_Nm,
                         axis.torque_per_volt,
                         drive.torque_limit_Nm,
+                        drive.negative_torque_limit_Nm,
                     )
                 else:
                     # The controller is to start without a bump when it gets the axis back.

@@ -94,12 +94,14 @@ class ServoLoop:
         torque_offset_Nm: float,
         torque_per_volt: float,
         torque_limit_Nm: float = inf,
+        negative_torque_limit_Nm: float | None = None,
     ) -> float:
         """Torque command for the coming servo period, in N m.
 
         ``gains`` are K_P, K_I, K_D, K_V, K_F as integers over 256. ``torque_offset_Nm`` is added at the converter's
         input: it shares the 12 bits and the limits with the controller. ``torque_per_volt`` (N m / V) is the
-        amplifier's. ``torque_limit_Nm`` narrows the output's limits to whole units within it.
+        amplifier's. ``torque_limit_Nm`` and ``negative_torque_limit_Nm`` (both positive numbers; None: the same)
+        narrow the output's limits to whole units within them.
         """
         gain_p, gain_i, gain_d, gain_v, gain_f = gains
         demand = float(floor(demand_counts + 0.5)) if self._round_error else demand_counts
@@ -118,7 +120,10 @@ class ServoLoop:
         limit = torque_limit_Nm / (torque_per_volt * VOLT_PER_UNIT)
         if limit < -OUTPUT_MINIMUM:
             maximum = floor(limit)
-            minimum = -maximum
+        if negative_torque_limit_Nm is not None:
+            limit = negative_torque_limit_Nm / (torque_per_volt * VOLT_PER_UNIT)
+        if limit < -OUTPUT_MINIMUM:
+            minimum = -floor(limit)
         if wanted >= maximum:
             output = maximum
             if error < 0.0:

@@ -6,6 +6,7 @@ import pytest
 from drive_bench import MS, Bench
 
 from sim_drive.cia402 import PowerState
+from sim_drive.servo import VOLT_PER_UNIT, ServoLoop
 from sim_drive.settings import DriveSettings
 
 REACHED, LIMITED, BIT_12 = 0x0400, 0x0800, 0x1000
@@ -250,3 +251,28 @@ def test_csp_does_not_run_over_a_software_limit():
     bench.tick()  # the overrun would lead to 30
     bench.tick()
     assert bench.drive.position_demand_counts == pytest.approx(25.0)
+
+
+# -- torque limits --------------------------------------------------------------------------------
+
+
+def test_the_least_of_max_torque_and_the_limit_of_the_direction_counts():
+    bench = cyclic(10, 0x60710010, (0x6072, 0, 800, 2), (0x60E0, 0, 500, 2), (0x60E1, 0, 900, 2))
+    assert bench.drive.torque_limit_Nm == pytest.approx(0.5 * 1.5)
+    assert bench.drive.negative_torque_limit_Nm == pytest.approx(0.8 * 1.5)
+    cycle(bench, "h", 1_000)
+    assert bench.drive.torque_demand_Nm == pytest.approx(0.5 * 1.5)
+    cycle(bench, "h", -1_000)
+    assert bench.drive.torque_demand_Nm == pytest.approx(-0.8 * 1.5)
+    bench.nmt(0x81)
+    bench.wake()
+    assert bench.drive.torque_limit_Nm == pytest.approx(3.0 * 1.5)
+
+
+def test_the_servo_loop_is_limited_in_each_direction():
+    for demand, units in ((1e6, 20), (-1e6, -40)):
+        servo = ServoLoop()
+        servo.reset(0.0, 0)
+        volt = 20 * VOLT_PER_UNIT
+        servo.update(demand, 0, (256, 0, 0, 0, 0), 0.0, 0.45, 0.45 * volt * 1.01, 0.45 * volt * 2.01)
+        assert servo.output_units == units

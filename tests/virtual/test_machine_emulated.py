@@ -52,6 +52,7 @@ class FakeDrive:
         self.torque_offset_Nm = 0.0
         self.torque_demand_Nm: float | None = None
         self.torque_limit_Nm = 4.5
+        self.negative_torque_limit_Nm = 4.5
         self.is_powered = False
         self.brake_released = False
         self.gains: tuple[int, ...] = (4000, 0, 0, 45_000, 45_000)
@@ -343,7 +344,7 @@ def test_the_drives_torque_limit_holds() -> None:
     drive.power()
     drive.gains = (0, 0, 0, 0, 0)
     drive.torque_offset_Nm = 3.0
-    drive.torque_limit_Nm = 0.5
+    drive.torque_limit_Nm = drive.negative_torque_limit_Nm = 0.5
     bench.run_until(50 * MS)
     # 227 whole units of 2.197 mN m are within 0.5 N m.
     assert bench.plant.torque(0) == pytest.approx(227 * 10 / 2048 * 0.45, rel=1e-9)
