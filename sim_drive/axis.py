@@ -42,6 +42,7 @@ from sim_drive.modes.profile_velocity import ProfileVelocity
 from sim_drive.motion import Latch, Motion, SetPointSource, wrap_int32
 from sim_drive.quirks import MODE_SWITCH_NS
 from sim_drive.settings import DriveSettings
+from sim_drive.touch_probe import TouchProbe
 
 __all__ = ["CONTROLLER_GAIN_COUNT", "FOLLOWING_ERROR_WINDOW_OFF", "Axis", "Latch", "SetPointSource", "wrap_int32"]
 
@@ -117,6 +118,7 @@ class Axis(Motion):
         "_torque_actual",
         "_torque_limits",
         "_torque_offset",
+        "_touch_probe",
         "_velocity_actual",
         "gains",
         "is_powered",
@@ -167,6 +169,7 @@ class Axis(Motion):
         """What 6072h and 60E1h allow in the negative direction, as a positive number."""
         self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
         self._rated_torque_Nm = settings.rated_torque_Nm
+        self._touch_probe = TouchProbe(self)
         self._has_switches = bool(settings.switches.fitted)
         self._set_defaults()
         self._set_hooks()
@@ -274,6 +277,7 @@ class Axis(Motion):
         self.torque_demand = None
         for mode in self._modes.values():
             mode.reset()
+        self._touch_probe.restore()
         self._idle_controlword = _NO_CONTROLWORD
         self.offset = self.settings.initial_offset_counts
         self.is_powered = False
@@ -343,19 +347,13 @@ class Axis(Motion):
     def on_tick(self, now_ns: int, shaft_counts: int) -> None:
         """One servo period: bring the demand up to ``now_ns`` and run what depends on time."""
         self.shaft_counts = shaft_counts
+        if self._touch_probe.is_enabled:
+            self._touch_probe.on_tick()
         if self._mode_entry.value != self._mode and self._is_mode_due(now_ns):
             self._switch_mode(now_ns)
         state = self._state
         if not self.is_powered:
-            self.position_demand_counts = float(shaft_counts)
-            self.demand.hold(float(shaft_counts))
-            if state is PowerState.NOT_READY_TO_SWITCH_ON:
-                # A fault whose cause has outlived a reset is a fault again.
-                is_healthy = not self._emergency.has_persisting_fault
-                ready = PowerState.SWITCH_ON_DISABLED if is_healthy else PowerState.FAULT_REACTION_ACTIVE
-                self._go_to_state(ready, now_ns)
-            elif state is PowerState.FAULT_REACTION_ACTIVE:
-                self._go_to_state(PowerState.FAULT, now_ns)
+            self._tick_without_power(now_ns)
             return
         demand = self.demand.at(now_ns)
         self.position_demand_counts = demand
@@ -376,6 +374,19 @@ class Axis(Motion):
         window = self._following_error_window.value
         if self._following_error_since_ns is not None or not -window <= demand - shaft_counts <= window:
             self._guard_following_error(demand - shaft_counts, now_ns)
+
+    def _tick_without_power(self, now_ns: int) -> None:
+        state = self._state
+        shaft_counts = self.shaft_counts
+        self.position_demand_counts = float(shaft_counts)
+        self.demand.hold(float(shaft_counts))
+        if state is PowerState.NOT_READY_TO_SWITCH_ON:
+            # A fault whose cause has outlived a reset is a fault again.
+            is_healthy = not self._emergency.has_persisting_fault
+            ready = PowerState.SWITCH_ON_DISABLED if is_healthy else PowerState.FAULT_REACTION_ACTIVE
+            self._go_to_state(ready, now_ns)
+        elif state is PowerState.FAULT_REACTION_ACTIVE:
+            self._go_to_state(PowerState.FAULT, now_ns)
 
     def _guard_following_error(self, error: float, now_ns: int) -> None:
         window = self._following_error_window.value
