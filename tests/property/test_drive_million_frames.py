@@ -13,6 +13,7 @@ import pytest
 from config.loading import load_config
 from drivers.eds import load_eds
 from drivers.frame import Frame
+from drivers.nmt import NmtState
 from gateway.preparation import prepare
 from gateway.recording import read_recording
 from gateway.virtual_run import run_virtual
@@ -73,6 +74,7 @@ SCRIPTS = [
     ("2F60600006000000", "2B4060000F000000", "2B4060001F000000"),
     ("2F60600003000000", "23FF600010270000", "2B4060000F010000", "2B4060000F000000"),
     ("2B5A600006000000", "2B40600002000000", "2B4060000F000000"),
+    ("2F60600007000000", "23C1600164000000", "23C16001C8000000", "2B4060001F000000", "23C160012C010000"),
     # Heartbeats, and an event-driven TPDO with inhibit and event timers.
     ("2316100132007F00", "2B17100032000000"),
     ("2300180181010080", "2F001802FF000000", "2B00180332000000", "2B0018050A000000", "2300180181010000"),
@@ -159,7 +161,8 @@ class Source:
         return self.recorded[self.place]
 
     def mutant(self) -> Frame:
-        frame = self.random.choice(self.recorded)
+        """A frame of the recording or of any other kind, with one to three changes."""
+        frame = self.random.choice((self.play, self.write, self.read, self.sdo, self.block, self.lss, self.time))()
         cob_id, data, is_remote = frame.cob_id, bytearray(frame.data), frame.is_remote
         for _ in range(self.random.randrange(1, 4)):
             change = self.random.randrange(5)
@@ -343,6 +346,10 @@ class Watch:
         self.put(Frame(0x7E5, bytes.fromhex("0400000000000000")))
         for node in NODES:
             self.put(Frame(0x600 + node, bytes.fromhex("8000000000000008")))
+        # Whoever shall answer does so before the reset, too.
+        for node, drive in zip(NODES, self.machine.drives, strict=True):
+            if drive.node_id == node and drive.nmt_state in {NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL}:
+                self.ask(node)
         booted = {frame.cob_id for frame in self.put(Frame(0x000, b"\x82\x00")) if frame.data == b"\0"}
         for node in NODES:
             if 0x700 + node in booted:
@@ -357,8 +364,11 @@ class Watch:
             self.put(Frame(0x7E5, bytes.fromhex("0400000000000000")))
             self.put(Frame(0x000, b"\x82\x00"))
         for node in NODES:
-            answers = self.put(Frame(0x600 + node, bytes.fromhex("4000100000000000")))
-            assert Frame(0x580 + node, bytes.fromhex("4300100092010200")) in answers, f"node {node} is silent"
+            self.ask(node)
+
+    def ask(self, node: int) -> None:
+        answers = self.put(Frame(0x600 + node, bytes.fromhex("4000100000000000")))
+        assert Frame(0x580 + node, bytes.fromhex("4300100092010200")) in answers, f"node {node} is silent"
 
     def begin(self) -> None:
         """What lets a round do more than be refused: operational, now and then with the defaults, and enabled."""
@@ -376,7 +386,7 @@ class Watch:
         if pick < 0.8:
             self.put(Frame(0x000, b"\x01\x00"))
             for node in NODES:
-                mode = self.random.choice(["01", "03", "04", "06", "08", "09", "0A"])
+                mode = self.random.choice(["01", "03", "04", "06", "07", "08", "09", "0A"])
                 option = f"2B5A60000{self.random.randrange(9)}000000"
                 for text in ("2B40600000000000", "2B40600080000000", f"2F606000{mode}000000", option):
                     self.put(Frame(0x600 + node, bytes.fromhex(text)))
