@@ -29,7 +29,7 @@ from sim_drive.cia402 import (
     StopRamp,
     next_state,
 )
-from sim_drive.dictionary import LiveDictionary
+from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.camming import Camming
@@ -136,8 +136,9 @@ class Axis(Motion):
         slots: CamSlots,
         emergency: EmergencyProducer,
         events: list[Event],
+        base: int = 0,
     ) -> None:
-        super().__init__(dictionary, settings)
+        super().__init__(dictionary, settings, base)
         self._node_id = node_id
         self._emergency = emergency
         self._events = events
@@ -154,6 +155,8 @@ class Axis(Motion):
         self._following_error = entry(objects.FOLLOWING_ERROR_ACTUAL_VALUE)
         self._digital_inputs = entry(objects.DIGITAL_INPUTS)
         self._digital_inputs.on_read = self._read_inputs
+        entry(objects.VELOCITY_DEMAND_VALUE).on_read = self._read_velocity_demand
+        entry(objects.TORQUE_DEMAND).on_read = self._read_torque_demand
         self._following_error_window = entry(objects.FOLLOWING_ERROR_WINDOW)
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
@@ -230,7 +233,7 @@ class Axis(Motion):
                 raise ValueError(f"a drive has {CONTROLLER_GAIN_COUNT} gains, not {len(settings.gains)}")
             defaults |= {(objects.CONTROLLER_GAINS, n + 1): gain for n, gain in enumerate(settings.gains)}
         for (index, subindex), value in defaults.items():
-            entry = self.dictionary.entry(index, subindex)
+            entry = self.entry(index, subindex)
             entry.default = value
             entry.value = value
 
@@ -250,11 +253,9 @@ class Axis(Motion):
             self._torque_actual,
             self._following_error,
         ):
-            entry.on_read = self._live_reader(entry.variable.index)
+            entry.on_read = self._live_reader(entry)
 
-    def _live_reader(self, index: int) -> Callable[[int], int]:
-        entry = self.dictionary.entry(index)
-
+    def _live_reader(self, entry: Entry) -> Callable[[int], int]:
         def read(now_ns: int) -> int:
             self.sample(now_ns)
             return entry.value
@@ -424,6 +425,17 @@ class Axis(Motion):
         if self._has_switches:
             self._digital_inputs.value = self.settings.switches.inputs(position)
         self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
+
+    def _read_velocity_demand(self, now_ns: int) -> int:
+        if not self.is_powered:
+            return 0
+        return _clamp(floor(self.demand.velocity_at(now_ns) + 0.5), _HALF - 1)
+
+    def _read_torque_demand(self, now_ns: int) -> int:
+        """What a torque mode asks for; under the position controller, what the amplifier gives."""
+        if self.torque_demand is None:
+            return _clamp(self.latch(now_ns)[2], _INT16_MAX)
+        return _clamp(floor(self.torque_demand + 0.5), _INT16_MAX)
 
     def _read_inputs(self, now_ns: int) -> int:
         return self.settings.switches.inputs(self.latch(now_ns)[0])

@@ -22,6 +22,8 @@ Latch = Callable[[int], tuple[int, float, int]]
 
 _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
+_FIRST_PROFILE_INDEX: Final = 0x6000
+_LAST_PROFILE_INDEX: Final = 0x67FF
 _S_PER_NS: Final = 1e-9
 _TWO_TICKS_S: Final = 0.002
 """Room for the servo tick at which braking is found to be due, and the one before it."""
@@ -49,6 +51,7 @@ class Motion(ABC):
 
     __slots__ = (
         "_acceleration",
+        "_base",
         "_deceleration",
         "_halt_option",
         "_max_acceleration",
@@ -77,8 +80,10 @@ class Motion(ABC):
         "torque_demand",
     )
 
-    def __init__(self, dictionary: LiveDictionary, settings: DriveSettings) -> None:
+    def __init__(self, dictionary: LiveDictionary, settings: DriveSettings, base: int = 0) -> None:
+        """``base`` is added to the indices 6000h to 67FFh of the drive profile area: n times 800h for logical axis n."""
         self.dictionary: Final = dictionary
+        self._base: Final = base
         self.settings: Final = settings
         self.demand: Final = Demand()
         self.latch: Latch = _no_latch
@@ -116,7 +121,9 @@ class Motion(ABC):
         self.limit_high = self.entry(objects.SOFTWARE_POSITION_LIMIT, 2)
 
     def entry(self, index: int, subindex: int = 0) -> Entry:
-        """The entry of an object of the axis."""
+        """The entry of an object of the axis, by its index in the first axis."""
+        if _FIRST_PROFILE_INDEX <= index <= _LAST_PROFILE_INDEX:
+            index += self._base
         return self.dictionary.entry(index, subindex)
 
     @abstractmethod

@@ -35,6 +35,7 @@ def test_pv_ramps_and_cruises():
     bench.must(0x60FF, 0, 5_000, 4)
     bench.run(51 * MS)  # taken at the first tick; 50 ms and 125 counts to speed
     assert bench.drive.position_demand_counts == pytest.approx(125.0)
+    assert bench.read(0x606B) == 5_000
     bench.run(100 * MS)
     assert bench.drive.position_demand_counts == pytest.approx(625.0)
     bench.must(0x60FF, 0, -5_000, 4)
@@ -223,6 +224,7 @@ def test_tq_starts_from_the_actual_torque_and_keeps_to_the_slope():
     assert bench.drive.torque_demand_Nm == pytest.approx(0.1 * 1.5)
     bench.tick()
     assert bench.drive.torque_demand_Nm == pytest.approx(0.11 * 1.5)
+    assert bench.read(0x6074) == 110
     assert bench.statusword & REACHED == 0
     bench.run(9 * MS)
     assert bench.drive.torque_demand_Nm == pytest.approx(0.2 * 1.5)
