@@ -81,7 +81,7 @@ class Motion(ABC):
     )
 
     def __init__(self, dictionary: LiveDictionary, settings: DriveSettings, base: int = 0) -> None:
-        """``base`` is added to the indices 6000h to 67FFh of the drive profile area: n times 800h for logical axis n."""
+        """``base`` is added to the indices 6000h to 67FFh of the profile area: n times 800h for logical axis n."""
         self.dictionary: Final = dictionary
         self._base: Final = base
         self.settings: Final = settings
