@@ -426,6 +426,18 @@ class Axis(Motion):
             self._digital_inputs.value = self.settings.switches.inputs(position)
         self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
 
+    def sample_actual_position(self, now_ns: int) -> None:
+        """``sample`` for a SYNC whose TPDOs carry no measured value but actual position and torque.
+
+        The other values are brought up to date when they are asked for.
+        """
+        if now_ns == self._sampled_at_ns:
+            return
+        position, _, torque = self.latch(now_ns)
+        shown = position + self.offset
+        self._position_actual.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
+        self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
+
     def _read_velocity_demand(self, now_ns: int) -> int:
         if not self.is_powered:
             return 0

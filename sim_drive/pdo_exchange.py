@@ -41,6 +41,7 @@ class PdoExchange:
         "_on_change",
         "_on_timer",
         "_rpdos",
+        "_sample",
         "_sync_at_ns",
         "_sync_cob_id",
         "_sync_period",
@@ -78,6 +79,7 @@ class PdoExchange:
         self._tpdos = [TransmitPdo(number, dictionary, axis, outbox, self.rearrange) for number in numbers]
         self._sync_rpdos: tuple[ReceivePdo, ...] = ()
         self._sync_tpdos: tuple[TransmitPdo, ...] = ()
+        self._sample = axis.sample
         self.event_tpdos: tuple[TransmitPdo, ...] = ()
         """Those that ``poll`` has something to do with."""
         self._waiting_tpdos: tuple[TransmitPdo, ...] = ()
@@ -128,6 +130,9 @@ class PdoExchange:
         waiting = [tpdo for tpdo in synchronous if has_counter and tpdo.sync_start_value and not tpdo.has_started]
         self._waiting_tpdos = tuple(waiting)
         self._sync_tpdos = tuple(tpdo for tpdo in synchronous if tpdo not in waiting)
+        measured = {entry.variable.index for tpdo in synchronous for entry in tpdo.entries if entry.on_read is not None}
+        is_position_alone = measured <= {objects.POSITION_ACTUAL_VALUE, objects.TORQUE_ACTUAL_VALUE}
+        self._sample = self._axis.sample_actual_position if is_position_alone else self._axis.sample
 
     # -- timers --------------------------------------------------------------------------------------------------
 
@@ -247,7 +252,7 @@ class PdoExchange:
         if self._emergency.has_errors:
             self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
         axis = self._axis
-        axis.sample(now_ns)
+        self._sample(now_ns)
         for tpdo in self._sync_tpdos:
             tpdo.on_sync(now_ns)
         axis.source = _SYNC
