@@ -82,7 +82,11 @@ def wait_for_motion(bus: can.BusABC, process: "subprocess.Popen[str]") -> None:
 def wait_until_disabled(node: canopen.RemoteNode) -> int:
     """The statusword's state once the drive has left Operation enabled, and has come to its rest."""
     for _ in range(100_000):
-        state = node.sdo[0x6041].raw & 0x6F
+        try:
+            state = node.sdo[0x6041].raw & 0x6F
+        except canopen.sdo.SdoCommunicationError:
+            # An answer to the gateway's own last request, which canopen's listener has only now come to.
+            continue
         if state & 0x4F in {0x08, 0x40}:
             return state & 0x4F
     raise AssertionError(f"node {node.id} is still in state {state:02X}")
