@@ -138,6 +138,7 @@ def test_a_killed_cyclic_process_is_a_fault_of_every_drive(
     assert len(read_recording(tmp_path / "run.mcap").samples) > 100
 
 
+@pytest.mark.slow
 def test_a_cyclic_process_that_has_lost_its_parent_stops_the_machine_on_the_cam(
     unhurried: Path, drive_gateway: Start, drives: list[canopen.RemoteNode], bus: can.BusABC, tmp_path: Path
 ) -> None:
