@@ -64,9 +64,9 @@ def download_image(
         # A table must not change under a drive that may be running it.
         yield from master.write(node_id, objects.PROFILE_SLOT_SELECTED, 0, U8, 0)
     say(f"writing {len(image)} bytes into slot {slot}")
-    yield from master.download_block(node_id, index, objects.PROFILE_SLOT_DATA, image, TRANSFER_TIMEOUT_S)
+    yield from master.download(node_id, index, objects.PROFILE_SLOT_DATA, image, TRANSFER_TIMEOUT_S)
     say("reading them back")
-    stored = yield from master.upload_block(node_id, index, objects.PROFILE_SLOT_DATA, TRANSFER_TIMEOUT_S)
+    stored = yield from master.upload(node_id, index, objects.PROFILE_SLOT_DATA, TRANSFER_TIMEOUT_S)
     if stored != image:
         different = next((i for i, (a, b) in enumerate(zip(stored, image, strict=False)) if a != b), None)
         where = f"{len(stored)} bytes instead of {len(image)}" if different is None else f"differs at byte {different}"
