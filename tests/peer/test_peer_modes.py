@@ -11,7 +11,7 @@ from canopen.profiles.p402 import BaseNode402
 
 EDS = str(Path(__file__).resolve().parents[2] / "config" / "eds" / "sim_drive.eds")
 PATIENCE_S = 10.0
-POLLS = 2000
+POLLS = 50_000
 NODE = 3
 
 
