@@ -19,7 +19,7 @@ from drivers.nmt import SYNC_COB_ID
 from drivers.object_dictionary import DataType
 from drivers.pdo import RPDO_BASE, TPDO_BASE, PdoLayout
 from gateway.demand import Demand
-from gateway.guard import Condition, Guard, StopReason
+from gateway.guard import Condition, Guard
 from gateway.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
 from gateway.units import HALF_RANGE, RANGE_MASK, AxisUnits
 
@@ -376,7 +376,3 @@ class CyclicLoop:
             *map(_torque_of, axes),
             *torque_offsets,
         )
-
-
-STOP_REASONS_WITHOUT_FAULT: Final = frozenset({StopReason.COMPLETED, StopReason.OPERATOR})
-"""Ends of a run that are not the machine saying no."""

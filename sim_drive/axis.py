@@ -107,7 +107,6 @@ class Axis(Motion):
         "_mode_display",
         "_mode_entry",
         "_modes",
-        "_node_id",
         "_position_actual",
         "_position_demand",
         "_rated_torque_Nm",
@@ -123,6 +122,7 @@ class Axis(Motion):
         "gains",
         "is_powered",
         "negative_torque_limit_Nm",
+        "node_id",
         "on_sync",
         "position_demand_counts",
         "torque_limit_Nm",
@@ -139,7 +139,8 @@ class Axis(Motion):
         base: int = 0,
     ) -> None:
         super().__init__(dictionary, settings, base)
-        self._node_id = node_id
+        self.node_id = node_id
+        """For its events alone; the drive changes it when it gets another one."""
         self._emergency = emergency
         self._events = events
 
@@ -554,7 +555,7 @@ class Axis(Motion):
         self._state = state
         self._after_ramp = None
         self._idle_controlword = _NO_CONTROLWORD
-        self._events.append(PowerStateChanged(now_ns, self._node_id, before, state))
+        self._events.append(PowerStateChanged(now_ns, self.node_id, before, state))
         was_powered = self.is_powered
         self.is_powered = state is PowerState.OPERATION_ENABLED or (
             was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}

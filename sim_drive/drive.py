@@ -438,7 +438,7 @@ class Drive:
             self._memory.apply(objects.DEVICE_TYPE, _LAST_COMMUNICATION_INDEX)
         for service in (self._emergency, self._sdo, self._producer, self._guard):
             service.set_node_id(node_id)
-        setattr(self.axis, "_node_id", node_id)  # noqa: B010 - for its events alone
+        self.axis.node_id = node_id
 
     def _tell_loss(self, reason: str, now_ns: int) -> None:
         if not self._emergency.is_active(EmergencyCode.PARAMETERS_LOST):
