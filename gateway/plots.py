@@ -1,74 +1,23 @@
-"""The report's figures, drawn with matplotlib and no screen.
+"""The figures of a run's report, drawn with matplotlib and no screen; how they look is `gateway.figure`'s."""
 
-A figure is drawn from a theme. The page's theme consists of marker colours that become CSS variables, so that one SVG
-reads on a light and on a dark page; the PNG theme is plain light.
-"""
-
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from io import BytesIO, StringIO
 from itertools import pairwise
 from typing import Any, Final
 
-import matplotlib
-import matplotlib.figure
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from gateway.analysis import BoolArray, FloatArray, RunData
+from gateway.figure import Axes, Figure, Theme, headroom, legend, new_figure, over_the_cycle, render_png, render_svg
 from gateway.paper_reference import TABLE_II, is_reference_machine
-
-# matplotlib's own annotations are partial, so its objects are untyped here.
-Figure = Any
-Axes = Any
-_mpl: Any = matplotlib
 
 _GRID_DEG: Final = 1.0
 _MAX_OVERLAID: Final = 24
 """More machine cycles than this are drawn as the band between their extremes."""
 _MAX_POINTS: Final = 1500
 """A line of more points is thinned to the extremes of as many bins as fit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Theme:
-    """Colours of a figure."""
-
-    ink: str
-    muted: str
-    grid: str
-    cv: str
-    servo: str
-    path: str
-    bad: str
-    paper: str
-
-
-PNG_THEME: Final = Theme(
-    ink="#1c2430",
-    muted="#5b6675",
-    grid="#dfe4ea",
-    cv="#0b7a75",
-    servo="#c2500a",
-    path="#4053c8",
-    bad="#c21f3a",
-    paper="#ffffff",
-)
-_PAGE_COLOURS: Final = {
-    "ink": "#010101",
-    "muted": "#020202",
-    "grid": "#030303",
-    "cv": "#040404",
-    "servo": "#050505",
-    "path": "#060606",
-    "bad": "#070707",
-    "paper": "#080808",
-}
-PAGE_THEME: Final = Theme(**_PAGE_COLOURS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,76 +32,12 @@ class Plot:
 
 def to_png(plot: Plot, data: RunData) -> bytes:
     """The figure as PNG, light, 160 dots an inch, its title above it."""
-    with _mpl.rc_context(_style(PNG_THEME)):
-        figure = plot.draw(data, PNG_THEME)
-        figure.suptitle(plot.title, x=0.01, ha="left", fontsize=12, fontweight="bold", color=PNG_THEME.ink)
-        FigureCanvasAgg(figure)
-        stream = BytesIO()
-        figure.savefig(stream, format="png", dpi=160, metadata={"Software": None})
-    return stream.getvalue()
+    return render_png(lambda theme: plot.draw(data, theme), plot.title)
 
 
 def to_svg(plot: Plot, data: RunData) -> str:
     """The figure as an SVG element that takes its colours and font from the page."""
-    with _mpl.rc_context(_style(PAGE_THEME)):
-        figure = plot.draw(data, PAGE_THEME)
-        FigureCanvasSVG(figure)
-        stream = StringIO()
-        nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
-        figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
-    svg = stream.getvalue()
-    svg = svg[svg.index("<svg") :]
-    # A hundredth of a point is finer than any screen, and halves the page.
-    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
-    for name, marker in _PAGE_COLOURS.items():
-        svg = svg.replace(marker, f"var(--{name})")
-    # One page holds several figures: their ids must differ.
-    svg = re.sub(r'(id="|url\(#|xlink:href="#)', lambda found: f"{found[1]}{plot.stem}-", svg)
-    svg = re.sub(r"'DejaVu Sans'[^;\"]*", "var(--font)", svg)
-    size = re.compile(r'(<svg[^>]*?) width="[^"]*"([^>]*?)', re.DOTALL)
-    svg = size.sub(r"\1\2", svg, count=1)
-    svg = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", svg, count=1, flags=re.DOTALL)
-    return svg.replace("<svg", f'<svg role="img" aria-label="{plot.title}"', 1)
-
-
-def _style(theme: Theme) -> dict[str, Any]:
-    return {
-        "font.family": "DejaVu Sans",
-        "font.size": 9.5,
-        "svg.fonttype": "none",
-        "svg.hashsalt": "drive-gateway",
-        "axes.edgecolor": theme.muted,
-        "axes.labelcolor": theme.ink,
-        "axes.titlecolor": theme.ink,
-        "axes.titlesize": 10,
-        "axes.titlelocation": "left",
-        "axes.linewidth": 0.7,
-        "axes.grid": True,
-        "axes.axisbelow": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.unicode_minus": True,
-        "grid.color": theme.grid,
-        "grid.linewidth": 0.7,
-        "text.color": theme.ink,
-        "xtick.color": theme.muted,
-        "ytick.color": theme.muted,
-        "xtick.labelcolor": theme.muted,
-        "ytick.labelcolor": theme.muted,
-        "xtick.major.width": 0.7,
-        "ytick.major.width": 0.7,
-        "legend.frameon": False,
-        "legend.fontsize": 9,
-        "lines.linewidth": 1.6,
-        "lines.solid_capstyle": "round",
-        "figure.facecolor": theme.paper,
-        "axes.facecolor": "none",
-        "path.simplify_threshold": 0.4,
-    }
-
-
-def _figure(width: float, height: float) -> Figure:
-    return matplotlib.figure.Figure(figsize=(width, height), layout="constrained")
+    return render_svg(lambda theme: plot.draw(data, theme), plot.title, plot.stem)
 
 
 # -- machine cycles laid over each other ---------------------------------------------------------------------------
@@ -216,20 +101,6 @@ def _draw_overlay(axes: Axes, lines: Overlay, colour: str, label: str) -> None:
     axes.plot(lines.grid_deg, lines.mean, color=colour, lw=1.7, label=f"{label}, mean")
 
 
-def _over_the_cycle(axes: Axes) -> None:
-    axes.set_xlim(0, 360)
-    axes.xaxis.set_major_locator(MultipleLocator(45))
-    axes.set_xlabel("θ2 demanded, within the machine cycle (deg)")
-
-
-def _legend(axes: Axes, theme: Theme, **keywords: Any) -> None:
-    if axes.get_legend_handles_labels()[1]:
-        legend = axes.legend(labelcolor=theme.ink, **keywords)
-        for handle in legend.legend_handles:
-            if handle.get_alpha() is not None:
-                handle.set_alpha(0.7)  # a single faint line is not to be seen
-
-
 def _degrees_beside(axes: Axes, data: RunData, axis: int, theme: Theme) -> None:
     scale = 360.0 / data.constants.axes[axis].counts_per_revolution
 
@@ -250,19 +121,10 @@ def _error_panel(axes: Axes, data: RunData, axis: int, theme: Theme, colour: str
     axes.axhline(0, color=theme.muted, lw=0.8)
     _draw_overlay(axes, overlay(data, data.error_counts[:, axis], mask), colour, "error")
     axes.set_ylabel("demand − actual (counts)")
-    _over_the_cycle(axes)
+    over_the_cycle(axes)
     _degrees_beside(axes, data, axis, theme)
-    _headroom(axes)
-    _legend(axes, theme, loc="upper right", ncols=2)
-
-
-def _headroom(axes: Axes) -> None:
-    """Room for the legend above the lines, and never a range of less than two units."""
-    low, high = axes.get_ylim()
-    if high - low < 2.0:
-        middle = (high + low) / 2
-        low, high = middle - 1.0, middle + 1.0
-    axes.set_ylim(low, high + 0.18 * (high - low))
+    headroom(axes)
+    legend(axes, theme, loc="upper right", ncols=2)
 
 
 # -- the figures ---------------------------------------------------------------------------------------------------
@@ -271,7 +133,7 @@ def _headroom(axes: Axes) -> None:
 def _servo(data: RunData, theme: Theme) -> Figure:
     axis = data.constants.slave_axis
     name = data.constants.axes[axis].name
-    figure = _figure(8.6, 5.6)
+    figure = new_figure(8.6, 5.6)
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1.15, 1))
     mask = data.is_steady & data.is_valid[:, axis]
     counts = data.samples["position_actual"][:, axis].astype(np.float64)
@@ -281,20 +143,20 @@ def _servo(data: RunData, theme: Theme) -> Figure:
     top.plot(demand.grid_deg, demand.mean, color=theme.ink, lw=1.1, ls=(0, (5, 3)), label="demand")
     top.set_ylabel(f"position of {name} (counts)")
     _degrees_beside(top, data, axis, theme)
-    _headroom(top)
-    _legend(top, theme, loc="upper left", ncols=3)
+    headroom(top)
+    legend(top, theme, loc="upper left", ncols=3)
     _error_panel(bottom, data, axis, theme, theme.servo)
     return figure
 
 
 def _cv(data: RunData, theme: Theme) -> Figure:
-    figure = _figure(8.6, 3.2)
+    figure = new_figure(8.6, 3.2)
     _error_panel(figure.subplots(), data, data.constants.master_axis, theme, theme.cv)
     return figure
 
 
 def _path(data: RunData, theme: Theme) -> Figure:
-    figure = _figure(8.6, 4.2)
+    figure = new_figure(8.6, 4.2)
     left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
     desired, actual = data.desired_mm, data.actual_mm
     if desired is None or actual is None:
@@ -323,17 +185,17 @@ def _path(data: RunData, theme: Theme) -> Figure:
     left.set_xlabel("x (mm)")
     left.set_ylabel("y (mm)")
     left.set_title("path of the end effector")
-    _legend(left, theme, loc="lower right", fontsize=8.5)
+    legend(left, theme, loc="lower right", fontsize=8.5)
     distance = np.hypot(*(actual - desired).T)
     _draw_overlay(right, overlay(data, distance, mask), theme.path, "distance")
     right.set_ylabel("distance from the desired point (mm)")
     right.set_title("error over the cycle")
-    _over_the_cycle(right)
+    over_the_cycle(right)
     right.set_xlabel("θ2 demanded (deg)")
     right.xaxis.set_major_locator(MultipleLocator(90))
     right.set_ylim(bottom=0)
     right.set_ylim(0, right.get_ylim()[1] * 1.2 or 1.0)
-    _legend(right, theme, loc="upper right")
+    legend(right, theme, loc="upper right")
     return figure
 
 
@@ -346,7 +208,7 @@ def _cycles(data: RunData, mask: BoolArray) -> Iterator[NDArray[np.intp]]:
 
 
 def _torque(data: RunData, theme: Theme) -> Figure:
-    figure = _figure(8.6, 4.4)
+    figure = new_figure(8.6, 4.4)
     panels = np.atleast_1d(figure.subplots(len(data.constants.axes), 1, sharex=True))
     for axis, axes in enumerate(panels):
         constants = data.constants.axes[axis]
@@ -359,18 +221,18 @@ def _torque(data: RunData, theme: Theme) -> Figure:
             fed = overlay(data, offset, data.is_steady)
             axes.plot(fed.grid_deg, fed.mean, color=theme.ink, lw=1.1, ls=(0, (5, 3)), label="feed-forward sent")
         axes.set_ylabel(f"{constants.name} (N m)")
-        _over_the_cycle(axes)
+        over_the_cycle(axes)
         if axis < len(panels) - 1:
             axes.set_xlabel("")
         low, high = axes.get_ylim()
         axes.set_ylim(low, high + 0.25 * (high - low))
-        _legend(axes, theme, loc="upper right", ncols=3)
+        legend(axes, theme, loc="upper right", ncols=3)
     return figure
 
 
 def _timing(data: RunData, theme: Theme) -> Figure:
     samples = data.samples
-    figure = _figure(8.6, 3.0)
+    figure = new_figure(8.6, 3.0)
     period_ns = data.constants.period_s * 1e9
     has_period = samples["sync_period_ns"] > 0
     panels = figure.subplots(1, 3, sharey=True)
@@ -411,7 +273,7 @@ def _histogram(axes: Axes, values: FloatArray, colour: str) -> None:
 
 
 def _run(data: RunData, theme: Theme) -> Figure:
-    figure = _figure(8.6, 4.6)
+    figure = new_figure(8.6, 4.6)
     speed, errors = figure.subplots(2, 1, sharex=True, height_ratios=(1, 1.3))
     shown = np.flatnonzero(data.is_following)
     seconds = (data.samples["sync_ns"] - (data.samples["sync_ns"][shown[0]] if len(shown) else 0)) / 1e9
@@ -450,8 +312,8 @@ def _run(data: RunData, theme: Theme) -> Figure:
         )
     errors.set_ylabel("demand − actual (counts)")
     errors.set_xlabel("time since the start of the motion (s)")
-    _headroom(errors)
-    _legend(errors, theme, loc="upper right", ncols=3)
+    headroom(errors)
+    legend(errors, theme, loc="upper right", ncols=3)
     return figure
 
 
