@@ -17,6 +17,12 @@ ROOT = Path(__file__).resolve().parent.parent
 PATIENCE_S = 120.0
 
 
+def pytest_configure() -> None:
+    """Signals as a terminal gives them: a suite started by nohup or in the background inherits them as ignored."""
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @contextmanager
 def sim_drive_process(folder: Path, config: str, options: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}

@@ -207,10 +207,10 @@ def test_a_recording_that_is_none(run, tmp_path):
         assert len(err.splitlines()) == 1
 
 
-def test_nothing_to_monitor(run):
-    status, _, err = run("monitor", "paper", "--once")
+def test_nothing_to_monitor(run, config):
+    status, _, err = run("monitor", config(("name: paper", "name: nobody-runs-this")), "--once")
     assert status == 1
-    assert "no run of paper" in err
+    assert "no run of nobody-runs-this" in err
 
 
 @pytest.mark.parametrize("arguments", [("run",), ("compile", "paper"), ("run", "paper", "--cycles", "0"), ("fly",)])
