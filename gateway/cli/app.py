@@ -5,6 +5,7 @@ from typing import Annotated, Final
 
 import typer
 
+from gateway.cli.animation_command import ANIMATE_EPILOG, animate
 from gateway.cli.cam_commands import CHECK_EPILOG, COMPILE_EPILOG, DOWNLOAD_EPILOG, check, compile_command, download
 from gateway.cli.run_commands import DEMO_EPILOG, RUN_EPILOG, demo, run
 from gateway.cli.terminal import errors_answered
@@ -22,6 +23,7 @@ app.command("compile", epilog=COMPILE_EPILOG)(compile_command)
 app.command("run", epilog=RUN_EPILOG)(run)
 app.command("report", epilog=REPORT_EPILOG)(report)
 app.command("download", epilog=DOWNLOAD_EPILOG)(download)
+app.command("animate", epilog=ANIMATE_EPILOG)(animate)
 app.command("monitor", epilog=MONITOR_EPILOG)(monitor_command)
 
 
