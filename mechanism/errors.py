@@ -104,6 +104,15 @@ class MotionError(MechanismError):
         self.reason = reason
 
 
+class SynthesisError(MechanismError):
+    """A synthesis cannot be done as asked; ``reason`` says why, ``term`` names the term that cannot be met."""
+
+    def __init__(self, reason: str, term: str | None = None) -> None:
+        super().__init__(reason)
+        self.reason = reason
+        self.term = term
+
+
 class CamFileError(MechanismError):
     """A cam file or cam image cannot be used.
 
