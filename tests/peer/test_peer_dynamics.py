@@ -1,8 +1,8 @@
 """The equations of motion against Pinocchio (https://github.com/stack-of-tasks/pinocchio), an independent engine.
 
 Pinocchio gets two open chains, p-q on the CV pivot and s-r on the servo pivot, from the configuration's own numbers,
-and nothing of `mechanism`. The loop is closed here with Pinocchio's kinematics alone: Newton's method on the distance of
-the two ends, their Jacobians' null space, and their accelerations.
+and nothing of `mechanism`. The loop is closed here with its kinematics alone: Newton's method on the distance of the two
+ends, their Jacobians' null space, and their accelerations.
 """
 
 import math
@@ -22,7 +22,7 @@ from mechanism.five_bar import Closure
 
 Float = NDArray[np.float64]
 
-STATES_IN_CYCLE = 720
+STATES_IN_CYCLE = 180
 
 
 @dataclass(frozen=True)
