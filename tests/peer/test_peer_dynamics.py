@@ -1,7 +1,7 @@
 """The equations of motion against Pinocchio (https://github.com/stack-of-tasks/pinocchio), an independent engine.
 
 Pinocchio gets two open chains, p-q on the CV pivot and s-r on the servo pivot, from the configuration's own numbers,
-and nothing of `mechanism`. The loop is closed here with its kinematics alone: Newton's method on the distance of the two
+and nothing of `mechanism`. The loop is closed here with its kinematics alone: Newton's method on the distance of both
 ends, their Jacobians' null space, and their accelerations.
 """
 
