@@ -157,6 +157,8 @@ class EmulatedDriveSection(Model):
     viscous_Nms: NotNegative = 0.0
     brake_torque_Nm: NotNegative
     resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    output_delay_periods: Annotated[int, Field(ge=0, le=1)] = 0
+    """Servo periods (1/1024 s) between the position and the output that the controller makes of it."""
     switches: SwitchesSection = SwitchesSection()
     quirks: frozenset[Quirk] = frozenset()
     """Habits of real drives that the emulated one is to have."""

@@ -146,4 +146,5 @@ def _machine_axis(axis: AxisSection) -> MachineAxis:
         torque_per_volt=axis.emulation.torque_per_volt_Nm,
         rated_torque_Nm=axis.rated_torque_Nm,
         resolver_noise_counts=axis.emulation.resolver_noise_counts,
+        output_delay_periods=axis.emulation.output_delay_periods,
     )

@@ -86,7 +86,9 @@ class MachineAxis:
     """Resolver and scaling of one axis.
 
     ``torque_per_volt`` in N m / V is the amplifier's; ``rated_torque_Nm`` is what 1000 per mille are;
-    ``resolver_noise_counts`` the standard deviation of the resolver's noise before it is quantised, 0 for none.
+    ``resolver_noise_counts`` the standard deviation of the resolver's noise before it is quantised, 0 for none;
+    ``output_delay_periods``: 1 where the controller's output acts one servo period after the position it was made from,
+    as in a drive that computes in between, 0 where it acts at once.
 
     Raises ValueError where a value is out of its bounds.
     """
@@ -96,6 +98,7 @@ class MachineAxis:
     rated_torque_Nm: float = 1.0
     resolver_noise_counts: float = 0.0
     demand_resolution: DemandResolution = DemandResolution.UNROUNDED_DIFFERENCE
+    output_delay_periods: int = 0
 
     def __post_init__(self) -> None:
         if self.counts_per_revolution < 1:
@@ -105,6 +108,8 @@ class MachineAxis:
                 raise ValueError(f"{name} = {value!r}, must be finite and positive")
         if not (isfinite(self.resolver_noise_counts) and self.resolver_noise_counts >= 0.0):
             raise ValueError(f"resolver_noise_counts = {self.resolver_noise_counts!r}, must be finite and zero or more")
+        if self.output_delay_periods not in (0, 1):
+            raise ValueError(f"output_delay_periods = {self.output_delay_periods!r}, must be 0 or 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +166,7 @@ class _Motor:
         "axis",
         "counts",
         "counts_per_rad",
+        "delayed_torque",
         "drive",
         "due_ns",
         "events",
@@ -189,6 +195,8 @@ class _Motor:
         self.velocity = 0.0
         """Counts/s, over the last servo period."""
         self.is_powered = False
+        self.delayed_torque = 0.0
+        """Torque command of the last servo tick, with an output delay."""
         self.tap: DriveTap | None = None
         self.wake_ns: int | None = None
         """When the drive wanted to be woken when it was asked last."""
@@ -436,10 +444,12 @@ class EmulatedMachine:
                 else:
                     # The controller is to start without a bump when it gets the axis back.
                     motor.servo.reset(demand, counts)
+                if axis.output_delay_periods:
+                    torque, motor.delayed_torque = motor.delayed_torque, torque
                 torques[index] = torque
             else:
                 motor.is_powered = False
-                torques[index] = 0.0
+                torques[index] = motor.delayed_torque = 0.0
             wake_ns = motor.next_wake_ns()
             if wake_ns != motor.wake_ns:
                 self._set_wake(motor, wake_ns)

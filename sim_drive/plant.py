@@ -406,6 +406,11 @@ class CoupledPlant:
         return self._steps * SERVO_PERIOD_S
 
     @property
+    def kernel_arguments(self) -> tuple[Float, Float, int, float, float, int]:
+        """What `advance_five_bar` is called with between the state and the commands."""
+        return self._constants
+
+    @property
     def state(self) -> AxisState:
         """theta2, theta5, their velocities and accelerations, and both amplifier torques (rad, s, N m)."""
         return self._values
