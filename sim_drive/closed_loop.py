@@ -396,7 +396,7 @@ class ClosedLoop:
     ) -> ClosedLoopRun:
         """Go on for n SYNCs with these ``targets`` (n, 2) in counts, and torque offsets (n, 2) in per mille.
 
-        Counts are the resolvers', which are 0 where the links' angles are. ``sync_ns`` (n,): other instants of the SYNCs
+        Counts are the resolvers', which are 0 where the links' angles are. ``sync_ns`` (n,): other instants of SYNCs
         than the regular ones, growing. Raises ValueError where the shapes do not fit.
         """
         count = len(targets)
