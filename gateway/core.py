@@ -13,7 +13,7 @@ from drivers.cia402 import ModeOfOperation, State, state_of
 from drivers.errors import DriveError, NodeError
 from drivers.frame import Frame
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, Master, NodeStateChanged, Procedure
-from drivers.nmt import NmtCommand, NmtState
+from drivers.nmt import SYNC_COB_ID, NmtCommand, NmtState
 from drivers.node import Event
 from gateway.commissioning import (
     NetworkSettings,
@@ -104,6 +104,10 @@ class GatewayCore:
         number = loop.tpdo_slots.get(frame.cob_id)
         if number is not None:
             if loop.is_running and not frame.is_remote and loop.receive_tpdo(number, frame.data, now_ns):
+                self._resume(now_ns)
+            return
+        if frame.cob_id == SYNC_COB_ID:
+            if loop.is_running and loop.receive_sync(now_ns):
                 self._resume(now_ns)
             return
         self.master.receive(frame, now_ns)

@@ -31,6 +31,12 @@ TPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataTyp
 SYNC_FRAME: Final = Frame(SYNC_COB_ID)
 TPDO_DEADLINE: Final = 0.8
 """Share of the cycle after which a TPDO counts as missed and the demand is sent without it."""
+SYNC_PATIENCE: Final = 2
+"""A SYNC that is late by this part of the period counts as missing."""
+SYNC_TAKE_OVER: Final = 3
+"""After so many missing SYNCs in a row the loop sends them itself."""
+GRID_FILTER: Final = 16
+"""The SYNC's grid follows what comes late by this part of the lateness."""
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
 
@@ -109,11 +115,14 @@ class CyclicLoop:
         "_cpu_ns",
         "_deadline_share_ns",
         "_demand",
+        "_doubtful",
         "_flags",
         "_in_force",
         "_is_closed",
+        "_is_taken",
         "_no_torque_offsets",
         "_no_velocities",
+        "_provisional",
         "_sent",
         "_sent_ns",
         "_sink",
@@ -121,12 +130,15 @@ class CyclicLoop:
         "_sync_due_ns",
         "_sync_ns",
         "_sync_period_ns",
+        "_wake_lateness_ns",
         "actuals_are_valid",
         "axes",
         "cycle",
         "guard",
         "is_guarding_enabled",
+        "is_paced",
         "is_running",
+        "missing_syncs",
         "outbox",
         "period_ns",
         "phase",
@@ -140,14 +152,22 @@ class CyclicLoop:
         guard: Guard,
         sink: SampleSink,
         cpu_clock: Callable[[], int] | None = None,
+        tpdo_deadline_ns: int | None = None,
     ) -> None:
-        """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0."""
+        """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0.
+
+        ``tpdo_deadline_ns``: how long after SYNC the TPDOs are waited for; None is ``TPDO_DEADLINE`` of the period.
+        """
         self.axes = axes
         self.period_ns = period_ns
         self.guard = guard
         self.outbox: list[Frame] = []
         self.cycle = -1
         self.is_running = False
+        self.is_paced = False
+        """SYNC is sent by somebody else, the kernel, and seen by ``receive_sync``; set before ``start``."""
+        self.missing_syncs = 0
+        """SYNCs in a row that were due and not seen."""
         self.actuals_are_valid = False
         """Every axis has sent a TPDO for the cycle that was closed last."""
         self.phase = Phase.COMMISSIONING
@@ -160,13 +180,21 @@ class CyclicLoop:
         self._cpu_last_ns = 0
         self._demand: Demand | None = None
         self._all_axes = (1 << len(axes)) - 1
-        self._deadline_share_ns = round(period_ns * (1.0 - TPDO_DEADLINE))
+        deadline_ns = round(period_ns * TPDO_DEADLINE) if tpdo_deadline_ns is None else tpdo_deadline_ns
+        self._deadline_share_ns = period_ns - deadline_ns
         self._sync_due_ns = 0
         self._sync_ns = 0
         self._sync_deviation_ns = 0
         self._sync_period_ns = 0
+        self._wake_lateness_ns = 0
         self._awaited = 0
+        self._doubtful = 0
+        """Axes whose TPDO was missed in the cycle before: the next one may be that one, come late."""
+        self._provisional = 0
+        """Doubtful axes of which one TPDO has come in this cycle."""
         self._is_closed = True
+        self._is_taken = True
+        """The demand sent last was on the bus before the SYNC that came last, so that the drives apply it."""
         self._arrival_ns = 0
         self._sent_ns = 0
         self._flags = 0
@@ -186,6 +214,8 @@ class CyclicLoop:
         self._sync_due_ns = now_ns + self.period_ns
         self._sync_ns = now_ns
         self._is_closed = True
+        self._is_taken = True
+        self.missing_syncs = 0
 
     def stop(self) -> None:
         """No further SYNC."""
@@ -217,8 +247,25 @@ class CyclicLoop:
     # -- the cycle -----------------------------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int:
-        """The TPDOs' deadline while they are awaited, else the next SYNC."""
-        return self._sync_due_ns if self._is_closed else self._sync_due_ns - self._deadline_share_ns
+        """The TPDOs' deadline while they are awaited, else the next SYNC, or when it counts as missing."""
+        if not self._is_closed:
+            return self._sync_due_ns - self._deadline_share_ns
+        return self._sync_due_ns + self.period_ns // SYNC_PATIENCE if self.is_paced else self._sync_due_ns
+
+    @property
+    def sync_due_ns(self) -> int:
+        """When the next SYNC is due."""
+        return self._sync_due_ns
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the demand of this cycle has been sent, and only the next SYNC is waited for."""
+        return self._is_closed
+
+    @property
+    def arrival_offset_ns(self) -> int:
+        """How long after its SYNC the last TPDO of this cycle came; 0 as long as none is there."""
+        return self._arrival_ns - self._sync_ns
 
     def wake(self, now_ns: int) -> bool:
         """Do what is due; returns whether a cycle was closed."""
@@ -226,17 +273,55 @@ class CyclicLoop:
         if not self._is_closed and now_ns >= self._sync_due_ns - self._deadline_share_ns:
             self._close(now_ns)
             closed = True
-        if now_ns >= self._sync_due_ns:
+        if self.is_paced:
+            if now_ns >= self._sync_due_ns + self.period_ns // SYNC_PATIENCE:
+                self._miss_sync(now_ns)
+        elif now_ns >= self._sync_due_ns:
             self._send_sync(now_ns)
         return closed
 
+    def receive_sync(self, at_ns: int) -> bool:
+        """The SYNC that paces this loop was on the bus at ``at_ns``; returns whether a cycle was closed."""
+        if not self.is_paced:
+            return False
+        was_open = not self._is_closed
+        if was_open:
+            # The loop has slept through its deadline: what it sends now comes too late for this SYNC.
+            self._close(at_ns)
+            self._sent_ns = at_ns + 1
+        if self.cycle >= 0:
+            self._account(at_ns)
+            self._is_taken = self._sent_ns <= at_ns
+        deviation_ns = at_ns - self._sync_due_ns
+        lost = (deviation_ns + self.period_ns // 2) // self.period_ns
+        if lost > 0:
+            self._sync_due_ns += lost * self.period_ns
+            self._flags = int(SampleFlag.OVERRUN)
+        else:
+            self._flags = 0
+        if self.missing_syncs:
+            self._flags |= SampleFlag.SYNC_LOST
+            self.missing_syncs = 0
+        # A timer is late, never early: the grid follows the earliest, and drifts slowly with what comes late.
+        late_ns = at_ns - self._sync_due_ns
+        self._sync_due_ns += late_ns if late_ns < 0 else late_ns // GRID_FILTER
+        self._begin(at_ns, deviation_ns)
+        return was_open
+
     def receive_tpdo(self, number: int, data: bytes, now_ns: int) -> bool:
-        """Take the TPDO of axis ``number``; returns whether it closed the cycle."""
+        """Take the TPDO of axis ``number``; returns whether it closed the cycle.
+
+        After a cycle without its TPDO the next one of an axis may be that one, come late: it then counts only when a
+        second one comes in the same cycle, or at the deadline.
+        """
         if len(data) != _TPDO_LENGTH:
             return False
         axis = self.axes[number]
         axis.statusword, axis.actual, axis.torque = _unpack_tpdo(data)
-        self._awaited &= ~(1 << number)
+        bit = 1 << number
+        if self._doubtful & bit and not self._is_own(bit, now_ns):
+            return False
+        self._awaited &= ~bit
         if self._awaited or self._is_closed:
             return False
         self._arrival_ns = now_ns
@@ -248,21 +333,60 @@ class CyclicLoop:
         if self._is_closed:
             self._sent_ns = now_ns
 
+    def note(self, flag: int) -> None:
+        """Something that the host has noticed in this cycle: a ``SampleFlag``."""
+        self._flags |= flag
+
+    def woke(self, lateness_ns: int) -> None:
+        """How late the host woke for this cycle, where that is not how late SYNC is."""
+        self._wake_lateness_ns = lateness_ns
+
+    def _is_own(self, bit: int, now_ns: int) -> bool:
+        """Whether the TPDO of a doubtful axis that has just come is certainly this cycle's."""
+        if not self._is_closed and not self._provisional & bit:
+            self._provisional |= bit
+            self._arrival_ns = now_ns
+            return False
+        self._doubtful &= ~bit
+        self._provisional &= ~bit
+        self._flags |= SampleFlag.LATE_TPDO
+        return True
+
+    def _miss_sync(self, now_ns: int) -> None:
+        self.missing_syncs += 1
+        self._flags |= SampleFlag.SYNC_LOST
+        self._sync_due_ns += self.period_ns
+        if self.missing_syncs >= SYNC_TAKE_OVER:
+            # Without SYNC no drive takes a demand, not even that of a stop.
+            self.is_paced = False
+            self._sync_due_ns = now_ns
+            self._send_sync(now_ns)
+
     def _send_sync(self, now_ns: int) -> None:
         lateness_ns = now_ns - self._sync_due_ns
         if self.cycle >= 0:
-            self._account()
+            # An overrun moves the grid on; the demand's deadline is the SYNC that was due next.
+            self._account(self._sync_due_ns)
         self.outbox.append(SYNC_FRAME)
         self._flags = 0
+        self._is_taken = True
+        if self.missing_syncs:
+            self._flags = int(SampleFlag.SYNC_LOST)
+            self.missing_syncs = 0
         if lateness_ns >= self.period_ns:
             # Lost cycles are not made up for: two SYNCs at once would be worse for the drives than a gap.
-            self._flags = int(SampleFlag.OVERRUN)
+            self._flags |= int(SampleFlag.OVERRUN)
             self._sync_due_ns += lateness_ns // self.period_ns * self.period_ns
+        self._begin(now_ns, lateness_ns)
+        self._wake_lateness_ns = lateness_ns
+
+    def _begin(self, sync_ns: int, deviation_ns: int) -> None:
+        """SYNC of the next cycle is on the bus."""
         self._sync_due_ns += self.period_ns
-        self._sync_deviation_ns = lateness_ns
-        self._sync_period_ns = now_ns - self._sync_ns
-        self._sync_ns = now_ns
-        self._arrival_ns = now_ns
+        self._sync_deviation_ns = deviation_ns
+        self._sync_period_ns = sync_ns - self._sync_ns
+        self._sync_ns = sync_ns
+        self._arrival_ns = sync_ns
         self._sent_ns = 0
         self.cycle += 1
         self._awaited = self._all_axes
@@ -272,10 +396,14 @@ class CyclicLoop:
         """All TPDOs of this cycle are here, or overdue: guard, demand, RPDOs."""
         self._is_closed = True
         self._sent_ns = now_ns
+        self._awaited &= ~self._provisional
+        self._provisional = 0
+        self._doubtful = self._awaited
         self._flags |= self._awaited
         self.actuals_are_valid = not self._awaited
         self._in_force = self._applied
-        self._applied = self._sent
+        if self._is_taken:
+            self._applied = self._sent
         if self.phase is not _COMMISSIONING:
             self._check(now_ns)
         demand = self._demand
@@ -287,7 +415,8 @@ class CyclicLoop:
             nothing = self._no_torque_offsets
             targets = list(map(_target_of, self.axes))
             self._sent = (self._sent[0], 0.0, self._no_velocities, targets, nothing, self.phase)
-        else:
+        elif self._is_taken:
+            # A demand that came too late is sent once more instead: two steps at once would be a jump.
             demand.step()
             self.phase = demand.phase
             self._sent = (
@@ -341,14 +470,13 @@ class CyclicLoop:
         elif self.guard.reaction is Reaction.CONTROLLED_STOP:
             self.controlled_stop()
 
-    def _account(self) -> None:
-        """Hand on the sample of the cycle that ends with the SYNC about to be sent."""
+    def _account(self, deadline_ns: int) -> None:
+        """Hand on the sample of the cycle that ends with SYNC; ``deadline_ns`` is that of its demand."""
         if self._cpu_clock is not None:
             cpu_ns = self._cpu_clock()
             self._cpu_ns = cpu_ns - self._cpu_last_ns if self._cpu_last_ns else 0
             self._cpu_last_ns = cpu_ns
-        # An overrun moves the grid on; the demand's deadline is the SYNC that was due next.
-        lead_ns = self._sync_due_ns - self._sent_ns
+        lead_ns = deadline_ns - self._sent_ns
         if lead_ns < 0:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
             self._hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
@@ -356,7 +484,7 @@ class CyclicLoop:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)
         arrival_ns = self._arrival_ns - self._sync_ns
         deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self._sync_period_ns, self._cpu_ns
-        spans_ns = (deviation_ns, period_ns, deviation_ns, arrival_ns, lead_ns, cpu_ns)
+        spans_ns = (deviation_ns, period_ns, self._wake_lateness_ns, arrival_ns, lead_ns, cpu_ns)
         if max(spans_ns) > INT32_MAX or min(spans_ns) < -INT32_MAX:
             spans_ns = map(saturate_int32, spans_ns)
         master_position, master_velocity, velocities, targets, torque_offsets, phase = self._in_force

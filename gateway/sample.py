@@ -51,6 +51,14 @@ class SampleFlag(IntFlag):
     """A demand went out after the next SYNC was due."""
     OVERRUN = 1 << 17
     """The loop took longer than a cycle, and at least one SYNC passed without it."""
+    LATE_TPDO = 1 << 18
+    """A TPDO came after its deadline, in this cycle or in the next one; no demand was made of it."""
+    SEND_BUFFER_FULL = 1 << 19
+    """The bus did not take a frame at once."""
+    BUS_ERROR = 1 << 20
+    """The controller reported an error frame."""
+    SYNC_LOST = 1 << 21
+    """At least one SYNC that another source was to send before this one was not seen."""
 
 
 MISSED_TPDO_MASK: Final = (1 << MAX_AXES) - 1
