@@ -243,6 +243,43 @@ class GuardSection(Model):
     heartbeat_lost: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
 
 
+class NominalLinksSection(Model):
+    """Links as the feed-forward's model has them; what is left out is the machine's."""
+
+    p: LinkSection | None = None
+    q: LinkSection | None = None
+    r: LinkSection | None = None
+    s: LinkSection | None = None
+
+
+class NominalAxisSection(Model):
+    """An axis as the feed-forward's model has it; what is left out is taken from its ``emulation``."""
+
+    inertia_kgm2: Positive | None = None
+    viscous_Nms: NotNegative | None = None
+    coulomb_Nm: NotNegative | None = None
+    drive_damping_Nms: Annotated[float, Field(ge=-1e3, le=1e3)] | None = None
+    """What the drive gives by itself in proportion to the demand's velocity beyond what it takes off in proportion to
+    the actual one: from K_F - K_V unless given."""
+    torque_limit_Nm: Positive | None = None
+    """Bound of the torque offset."""
+
+
+class FeedForwardSection(Model):
+    """Torque offsets from the model of the machine along the cam."""
+
+    enabled: bool = False
+    torque_delay_us: Annotated[float, Field(ge=0.0, le=100_000.0)] | None = None
+    """From the SYNC that applies a torque offset to the torque on the shaft; null: that of the emulated drives, half a
+    servo period, their output delay and the amplifier's time constant."""
+    coulomb_velocity_rad_per_s: Positive = 0.1
+    """Speed below which dry friction fades: it must not jump where an axis reverses."""
+    links: NominalLinksSection = NominalLinksSection()
+    end_effector_mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
+    gravity_m_s2: Point | None = None
+    axes: dict[AxisName, NominalAxisSection] = {}
+
+
 class EmulatorSection(Model):
     """The emulated machine as a whole."""
 
@@ -262,6 +299,7 @@ class GatewayConfig(Model):
     axes: Annotated[dict[AxisName, AxisSection], Field(min_length=2, max_length=2)]
     bus: BusSection = BusSection()
     guard: GuardSection = GuardSection()
+    feed_forward: FeedForwardSection = FeedForwardSection()
     emulator: EmulatorSection = EmulatorSection()
     _path: Path = Path()
     _text: str = ""
@@ -325,6 +363,9 @@ class GatewayConfig(Model):
                 f"bus.heartbeat_timeout_ms: {self.bus.heartbeat_timeout_ms} is below twice heartbeat_ms "
                 f"({self.bus.heartbeat_ms}), a single late heartbeat would stop the machine"
             )
+        for name in self.feed_forward.axes:
+            if name not in self.axes:
+                raise ValueError(f"feed_forward.axes.{name}: there is no such axis, they are {' and '.join(self.axes)}")
         load = self.bus.load(len(self.axes))
         if load > MAX_BUS_LOAD:
             raise ValueError(

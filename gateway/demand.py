@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Final, Protocol
 
 from gateway.sample import Phase
+from gateway.torque_offsets import TorqueOffsets
 from gateway.units import AxisUnits, wrap_counts
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import MasterPhase, MasterPlan, plan_stop
@@ -57,12 +58,17 @@ class CamDemand:
         period_s: float,
         acceleration_limit: float,
         jerk_limit: float,
+        torques: TorqueOffsets | None = None,
     ) -> None:
-        """``acceleration_limit`` (rad/s^2) and ``jerk_limit`` (rad/s^3) bound the master's controlled stop."""
+        """``acceleration_limit`` (rad/s^2) and ``jerk_limit`` (rad/s^3) bound the master's controlled stop.
+
+        ``torques`` makes the torque offsets, which are all 0 without it.
+        """
         self._cam = cam
         self._units = units
         self._period_s = period_s
         self._limits = (acceleration_limit, jerk_limit)
+        self._torques = torques
         self._plan: MasterPlan | None = None
         self._step = 0
         self._acceleration = 0.0
@@ -71,6 +77,7 @@ class CamDemand:
         """Whole revolutions, in counts, that each axis stands away from the plan's: see ``align``."""
         self._approach = (0, 0)
         self._approach_left = 0
+        """Steps until the axes are wholly on the plan, and their torque offsets wholly in force."""
         self._approach_steps = 1
         self.targets = [0, 0]
         self.torque_offsets = [0, 0]
@@ -83,12 +90,14 @@ class CamDemand:
         """Follow ``plan`` from its start with the next step.
 
         ``held_targets`` (counts) is where the axes are held now: what they are away from the plan's start is taken back
-        smoothly within ``APPROACH_S``, so that no target ever jumps.
+        smoothly within ``APPROACH_S``, so that no target ever jumps. Over the same time the torque offsets come in: the
+        position controllers hold the axes until then, and a whole offset at once would push them.
         """
         self._follow(plan)
         start = self.align(self.master_position, (held_targets[MASTER], held_targets[SLAVE]))
         self._approach = (held_targets[MASTER] - start[MASTER], held_targets[SLAVE] - start[SLAVE])
-        self._approach_left = round(APPROACH_S / self._period_s) if any(self._approach) else 0
+        is_approaching = any(self._approach) or self._torques is not None
+        self._approach_left = round(APPROACH_S / self._period_s) if is_approaching else 0
         self._approach_steps = max(self._approach_left, 1)
 
     def _follow(self, plan: MasterPlan) -> None:
@@ -134,13 +143,15 @@ class CamDemand:
             wrap_counts(self._units[MASTER].counts(position) + master_turns),
             wrap_counts(self._units[SLAVE].counts(theta5) + slave_turns),
         ]
+        share = 0.0
         if self._approach_left:
             self._approach_left -= 1
             left = self._approach_left / self._approach_steps
             share = left * left * (3.0 - 2.0 * left)
             for number, away in enumerate(self._approach):
                 self.targets[number] = wrap_counts(self.targets[number] + round(share * away))
-        self.torque_offsets = [0, 0]
+        if self._torques is not None:
+            self.torque_offsets = self._torques.at(position, velocity, self._acceleration, 1.0 - share)
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         self.phase = phase
         if self._is_stopping and phase is not Phase.STANDSTILL:

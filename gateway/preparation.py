@@ -17,6 +17,7 @@ from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
 from gateway.powering import AxisSetup
+from gateway.torque_offsets import build_torque_offsets, torque_violations
 from gateway.units import AxisUnits
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
@@ -80,6 +81,7 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
         *cam.violations,
         *_ramp_violations(config, cam.profile),
         *_home_violations(config, cam.profile),
+        *torque_violations(config, cam.profile),
     )
     if is_strict and violations:
         raise GatewayError("\n".join(str(violation) for violation in violations))
@@ -222,12 +224,14 @@ def build_core(
     ]
     guard = Guard(config.guard, config.axis_names)
     loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock)
+    units = (channels[0].units, channels[1].units)
     demand = CamDemand(
         profile,
-        (channels[0].units, channels[1].units),
+        units,
         config.cycle_s,
         config.motion.ramp_acceleration_rad_per_s2,
         config.motion.ramp_jerk_rad_per_s3,
+        build_torque_offsets(config, profile, units),
     )
     return GatewayCore(
         setups, network_settings(config), build_master(config), loop, demand, run_plan, guard, is_homing_again

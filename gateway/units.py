@@ -6,6 +6,7 @@ from typing import Final
 
 HALF_RANGE: Final = 1 << 31
 RANGE_MASK: Final = (1 << 32) - 1
+INT16_MAX: Final = 32767
 
 
 def wrap_counts(counts: int) -> int:
@@ -32,3 +33,7 @@ class AxisUnits:
     def counts_in(self, angle_rad: float) -> int:
         """A difference in rad as counts."""
         return round(angle_rad * self.counts_per_revolution / math.tau)
+
+    def permille(self, torque_Nm: float) -> int:
+        """Nearest torque in per mille of rated torque, not bounded."""
+        return round(torque_Nm * 1000.0 / self.rated_torque)

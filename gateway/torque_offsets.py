@@ -1,0 +1,129 @@
+"""Torque offsets (60B2h): what the model of the machine and what has been learned say that the motion will take.
+
+A demand asks once a cycle, with the master's position, velocity and acceleration at the instant of the target that it
+sends. The torque sent with that target acts at another instant; see ``torque_lead_s``.
+"""
+
+from math import degrees, tau
+from typing import Final
+
+import numpy as np
+
+from config.conversion import (
+    closure_at_home,
+    desired_curve,
+    drive_damping,
+    nominal_parameters,
+    torque_delay_s,
+    torque_offset_limit,
+)
+from config.schema import GatewayConfig
+from gateway.errors import GatewayError
+from gateway.feed_forward import FeedForward
+from gateway.learning import Learning
+from gateway.units import INT16_MAX, AxisUnits
+from mechanism.cam_profile import CamProfile
+
+TORQUE_GRID: Final = 1024
+
+
+def torque_lead_s(cycle_s: float, torque_delay_s: float) -> float:
+    """How much later than its target the torque sent with it acts, seconds.
+
+    A target is reached one cycle after the SYNC that applies it; the torque begins to act at that SYNC, is held for a
+    cycle (on average: half of it), and takes ``torque_delay_s`` more for the drive's sampling and its amplifier.
+    """
+    return torque_delay_s - 0.5 * cycle_s
+
+
+class TorqueOffsets:
+    """The torque offsets of both axes in per mille of rated torque, model and learning together, bounded."""
+
+    __slots__ = ("_feed_forward", "_lead_s", "_limits", "_units", "learning")
+
+    def __init__(
+        self,
+        units: tuple[AxisUnits, AxisUnits],
+        limits_Nm: tuple[float, float],
+        lead_s: float,
+        feed_forward: FeedForward | None = None,
+        learning: Learning | None = None,
+    ) -> None:
+        """``limits_Nm`` bounds either axis' offset, both ways; ``lead_s``: see ``torque_lead_s``."""
+        self._units = units
+        self._limits = tuple(min(unit.permille(limit), INT16_MAX) for unit, limit in zip(units, limits_Nm, strict=True))
+        self._lead_s = lead_s
+        self._feed_forward = feed_forward
+        self.learning = learning
+
+    def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
+        """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""
+        lead = self._lead_s
+        position += lead * (velocity + 0.5 * lead * acceleration)
+        velocity += lead * acceleration
+        master = slave = 0.0
+        if self._feed_forward is not None:
+            master, slave = self._feed_forward.torques(position, velocity, acceleration)
+        if self.learning is not None:
+            learned = self.learning.torques(position, velocity)
+            master += learned[0]
+            slave += learned[1]
+        units, limits = self._units, self._limits
+        master_offset = units[0].permille(share * master)
+        slave_offset = units[1].permille(share * slave)
+        return [
+            max(-limits[0], min(limits[0], master_offset)),
+            max(-limits[1], min(limits[1], slave_offset)),
+        ]
+
+
+def build_torque_offsets(
+    config: GatewayConfig, profile: CamProfile, units: tuple[AxisUnits, AxisUnits], learning: Learning | None = None
+) -> TorqueOffsets | None:
+    """The torque offsets that a configuration asks for on this cam; None if it asks for none.
+
+    Raises mechanism.errors.MechanismError for a curve that cannot be read.
+    """
+    if not config.feed_forward.enabled and learning is None:
+        return None
+    master, slave = config.axis_names
+    return TorqueOffsets(
+        units,
+        (torque_offset_limit(config, master), torque_offset_limit(config, slave)),
+        torque_lead_s(config.cycle_s, torque_delay_s(config)),
+        build_feed_forward(config, profile) if config.feed_forward.enabled else None,
+        learning,
+    )
+
+
+def build_feed_forward(config: GatewayConfig, profile: CamProfile) -> FeedForward:
+    """The model of the configuration's machine along this cam; see ``build_torque_offsets``."""
+    master, slave = config.axis_names
+    return FeedForward(
+        nominal_parameters(config),
+        closure_at_home(config, desired_curve(config)),
+        profile,
+        config.feed_forward.coulomb_velocity_rad_per_s,
+        (drive_damping(config, master), drive_damping(config, slave)),
+    )
+
+
+def torque_violations(config: GatewayConfig, profile: CamProfile) -> list[GatewayError]:
+    """A sentence for each axis whose feed-forward needs more torque at the cam's full speed than its bound allows."""
+    if not config.feed_forward.enabled:
+        return []
+    model = build_feed_forward(config, profile)
+    theta2 = np.arange(TORQUE_GRID) * (tau / TORQUE_GRID)
+    torques = np.abs([model.torques(position, config.speed_rad_per_s, 0.0) for position in theta2.tolist()])
+    violations: list[GatewayError] = []
+    for axis, name in enumerate(config.axis_names):
+        worst = int(np.argmax(torques[:, axis]))
+        needed, bound = float(torques[worst, axis]), torque_offset_limit(config, name)
+        if needed > bound:
+            violations.append(
+                GatewayError(
+                    f"feed_forward: axis {name} needs {needed:.3f} Nm at theta2 = {degrees(theta2[worst]):.1f} deg at "
+                    f"{config.motion.speed_rpm:g} rpm (bound {bound:g} Nm)"
+                )
+            )
+    return violations
