@@ -120,11 +120,11 @@ class Learning:
 
 def _resampled(torque: Float, bins: int) -> Float:
     """Torques at another number of bins, linear between them."""
-    count = torque.shape[1]
+    count = int(torque.shape[1])
     if count == bins:
         return torque
-    at = (np.arange(bins) + 0.5) * (tau / bins)
-    known = (np.arange(count) + 0.5) * (tau / count)
+    at = (np.arange(bins, dtype=np.float64) + 0.5) * (tau / bins)
+    known = (np.arange(count, dtype=np.float64) + 0.5) * (tau / count)
     out = np.empty((kernels.AXES, bins))
     for axis in range(kernels.AXES):
         out[axis] = np.interp(at, known, torque[axis], period=tau)
