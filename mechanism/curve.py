@@ -1,37 +1,34 @@
 """The desired curve: where the end effector shall be at which angle of the constant-velocity axis."""
 
-import csv
-import io
 from dataclasses import dataclass
-from math import degrees, isfinite, radians, tau
+from math import degrees, radians, tau
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mechanism.curve_csv import MAXIMUM_FILE_BYTES, MAXIMUM_ROWS, parse_table, read_text
 from mechanism.errors import CurveError
+
+__all__ = [
+    "COLUMNS",
+    "MAXIMUM_FILE_BYTES",
+    "MAXIMUM_POINTS",
+    "MINIMUM_POINTS",
+    "DesiredCurve",
+    "load_curve_csv",
+    "parse_curve_csv",
+    "read_only",
+]
 
 Float = NDArray[np.float64]
 
 MINIMUM_POINTS: Final = 5
-MAXIMUM_POINTS: Final = 100_000
-MAXIMUM_FILE_BYTES: Final = 4_000_000
+MAXIMUM_POINTS: Final = MAXIMUM_ROWS
 COLUMNS: Final = ("theta2_deg", "x_mm", "y_mm")
 
 _GREATEST_GAP_RAD: Final = radians(120.0)
-_WRONG_UNITS: Final = {
-    "theta2_rad": "theta2_deg",
-    "theta2": "theta2_deg",
-    "x_m": "x_mm",
-    "y_m": "y_mm",
-    "x_cm": "x_mm",
-    "y_cm": "y_mm",
-    "x_in": "x_mm",
-    "y_in": "y_mm",
-    "x": "x_mm",
-    "y": "y_mm",
-}
 
 
 def read_only(values: ArrayLike) -> Float:
@@ -105,65 +102,13 @@ class DesiredCurve:
         return np.stack((self.x, self.y), axis=1)
 
 
-def _check_header(header: list[str], source: str) -> None:
-    expected = ",".join(COLUMNS)
-    for name in header:
-        right = _WRONG_UNITS.get(name)
-        if right is not None:
-            raise CurveError(f"column {name} has the wrong unit or none, expected {right}", source)
-    if tuple(header) != COLUMNS:
-        found = ",".join(header)[:80]
-        raise CurveError(f"the columns are '{found}', expected '{expected}'", source)
-
-
-def _read_row(row: list[str], number: int, source: str) -> tuple[float, float, float]:
-    if len(row) != len(COLUMNS):
-        raise CurveError(f"{len(row)} values, expected {len(COLUMNS)}", source, number)
-    values: list[float] = []
-    for name, text in zip(COLUMNS, row, strict=True):
-        try:
-            value = float(text)
-        except ValueError:
-            raise CurveError(f"{name} is '{text[:40]}', not a number", source, number) from None
-        if not isfinite(value):
-            raise CurveError(f"{name} is {value}, not a finite number", source, number)
-        values.append(value)
-    return values[0], values[1], values[2]
-
-
 def parse_curve_csv(text: str, source: str) -> DesiredCurve:
     """A desired curve from the text of a CSV file with the columns theta2_deg, x_mm, y_mm. Raises CurveError."""
-    reader = csv.reader(io.StringIO(text.removeprefix("\ufeff")), strict=True)
-    rows: list[tuple[float, float, float]] = []
-    try:
-        header = next(reader, None)
-        if header is None:
-            raise CurveError("the file is empty", source)
-        _check_header([name.strip() for name in header], source)
-        for row in reader:
-            if not row:
-                continue
-            if len(rows) >= MAXIMUM_POINTS:
-                raise CurveError(f"more than {MAXIMUM_POINTS} rows", source)
-            rows.append(_read_row(row, len(rows) + 1, source))
-    except csv.Error as error:
-        raise CurveError(f"not a CSV file ({error})", source) from None
-    table = np.array(rows, dtype=np.float64).reshape(-1, 3)
+    _, table = parse_table(text, source, (COLUMNS,))
     return DesiredCurve(np.radians(table[:, 0]), table[:, 1] * 1e-3, table[:, 2] * 1e-3, source)
 
 
 def load_curve_csv(path: Path | str) -> DesiredCurve:
     """Read a desired curve: CSV, columns theta2_deg, x_mm, y_mm, at most 4 MB and 100 000 rows. Raises CurveError."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAXIMUM_FILE_BYTES + 1)
-    except OSError as error:
-        raise CurveError(f"cannot be read ({error.strerror or type(error).__name__})", str(path)) from None
-    if len(data) > MAXIMUM_FILE_BYTES:
-        raise CurveError(f"larger than {MAXIMUM_FILE_BYTES} bytes", str(path))
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError:
-        raise CurveError("not a text file (UTF-8)", str(path)) from None
-    return parse_curve_csv(text, str(path))
+    return parse_curve_csv(read_text(path), str(path))
