@@ -145,18 +145,65 @@ class SwitchesSection(Model):
         return self
 
 
+class FrictionLaw(Enum):
+    """What dry friction does around standstill."""
+
+    STICK_SLIP = "stick_slip"
+    """It holds an axis that stands, exactly."""
+    SMOOTHED = "smoothed"
+    """It is a steep function of velocity, and an axis under load creeps."""
+
+
+class MotorSection(Model):
+    """The electrical side of motor and amplifier: what it draws, and what bounds the torque at speed."""
+
+    torque_constant_Nm_per_A: Positive = 0.45
+    """The back-EMF constant in V s/rad too."""
+    resistance_ohm: Positive = 1.5
+    supply_voltage_V: Positive | None = None
+    """What the amplifier can put on the motor, either way; null for as much as it takes."""
+    regeneration: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Share of braking power that the supply takes back; the rest is heat in a brake chopper."""
+    idle_W: NotNegative = 0.0
+    """What the amplifier draws as long as it has its supply."""
+
+
+class CouplingSection(Model):
+    """A flexible coupling between motor and link; the resolver, friction and the brake are on the motor's side."""
+
+    stiffness_Nm_per_rad: Positive
+    damping_Nms_per_rad: NotNegative = 0.0
+    backlash_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 0.0
+    """Play, from one end to the other."""
+    link_side_inertia_kgm2: NotNegative = 0.0
+    """The coupling's half on the link; ``inertia_kgm2`` is then what turns with the motor."""
+
+
 class EmulatedDriveSection(Model):
     """Motor and amplifier of the emulated drive; a gateway against real drives does not read it."""
 
     gains: GainsSection
     torque_per_volt_Nm: Positive
     torque_time_constant_s: Annotated[float, Field(ge=1e-5, le=1.0)]
+    """1 / (2 pi bandwidth) of the current loop."""
     torque_limit_Nm: Positive
     inertia_kgm2: Positive
     coulomb_Nm: NotNegative = 0.0
     viscous_Nms: NotNegative = 0.0
+    friction_law: FrictionLaw = FrictionLaw.STICK_SLIP
+    friction_smoothing_rad_per_s: Annotated[float, Field(ge=1e-4, le=100.0)] = 0.05
+    """Smoothed friction reaches tanh(1) = 76 % at this velocity."""
+    breakaway_Nm: NotNegative = 0.0
+    """What holds an axis that stands, where that is more than ``coulomb_Nm``; with stick_slip alone."""
     brake_torque_Nm: NotNegative
+    motor: MotorSection = MotorSection()
+    coupling: CouplingSection | None = None
+    """null for a motor that sits on its link rigidly."""
     resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    resolver_eccentricity_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
+    """Amplitude of an error once a revolution, of a rotor that does not run true."""
+    resolver_eccentricity_deg: float = 0.0
+    """Angle at which that error passes zero, rising."""
     output_delay_periods: Annotated[int, Field(ge=0, le=1)] = 0
     """Servo periods (1/1024 s) between the position and the output that the controller makes of it."""
     switches: SwitchesSection = SwitchesSection()

@@ -85,6 +85,9 @@ CAM_MASTER_OFFSET: Final = 0x3012
 """INTEGER32: counts added to the master position before the table is read."""
 CONTROLLER_GAINS: Final = 0x3020
 """Record: K_P, K_I, K_D, K_V, K_F of the position controller as integers over 256 (INTEGER32 each)."""
+DRIVE_ENERGY: Final = 0x3040
+"""Record, read only, INTEGER32 in mJ since power-on, modulo 2^32: drawn from the supply, work of the shaft, copper
+loss."""
 TIME_OF_DAY: Final = 0x3030
 """Record, read only: what the TIME messages have told; UNSIGNED32 milliseconds after midnight, UNSIGNED16 days since
 1984-01-01."""

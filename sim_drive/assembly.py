@@ -2,20 +2,23 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from math import inf
+from functools import partial
+from math import inf, radians
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
 from config.loading import SHIPPED
-from config.schema import AxisSection, GatewayConfig
+from config.schema import AxisSection, FrictionLaw, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
 from sim_drive.drive import Drive
+from sim_drive.driveline import MotorParameters
+from sim_drive.energy_meter import attach_energy_meter
 from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.node_row import describe_row
 from sim_drive.parameter_file import make_parameter_store
-from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, PlantParameters
+from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, Plant, PlantParameters
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.switches import Switches
 
@@ -49,6 +52,7 @@ def build_machine(config: GatewayConfig, seed: int = 0, start_ns: int = 0, recor
     )
     theta2, theta5 = home_angles(config)
     plant = CoupledPlant(parameters, theta2, theta5)
+    _attach_meters(drives, plant)
     return EmulatedMachine(drives, plant, [_machine_axis(axis) for axis in axes], start_ns, seed, record_ticks)
 
 
@@ -80,6 +84,7 @@ def free_machine(
     drives = [_make_drive(node_id, _settings_in_row(common, node_id), describe) for node_id in node_ids]
     axis = MachineAxis(common.counts_per_revolution, rated_torque_Nm=common.rated_torque_Nm)
     plant = FreeAxisPlant([FREE_AXIS] * len(drives), [0.0] * len(drives))
+    _attach_meters(drives, plant)
     return EmulatedMachine(drives, plant, [axis] * len(drives), start_ns, seed, record_ticks)
 
 
@@ -111,6 +116,11 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
     )
 
 
+def _attach_meters(drives: Sequence[Drive], plant: Plant) -> None:
+    for axis, drive in enumerate(drives):
+        attach_energy_meter(drive.dictionary, partial(plant.axis_energy, axis))
+
+
 def _make_drive(node_id: int, settings: DriveSettings, describe: Callable[[int], ObjectDictionary]) -> Drive:
     return Drive(node_id, describe(node_id), settings, decode_cam_image, make_parameter_store(settings), describe)
 
@@ -137,6 +147,17 @@ def _driveline(axis: AxisSection) -> AxisDriveline:
         torque_limit_Nm=emulation.torque_limit_Nm,
         torque_time_constant_s=emulation.torque_time_constant_s,
         brake_torque_Nm=emulation.brake_torque_Nm,
+        friction_smoothing_rad_per_s=(
+            emulation.friction_smoothing_rad_per_s if emulation.friction_law is FrictionLaw.SMOOTHED else 0.0
+        ),
+        breakaway_N_m=emulation.breakaway_Nm,
+        motor=MotorParameters(
+            torque_constant_Nm_per_A=emulation.motor.torque_constant_Nm_per_A,
+            resistance_ohm=emulation.motor.resistance_ohm,
+            supply_voltage_V=inf if emulation.motor.supply_voltage_V is None else emulation.motor.supply_voltage_V,
+            regeneration=emulation.motor.regeneration,
+            idle_W=emulation.motor.idle_W,
+        ),
     )
 
 
@@ -147,4 +168,6 @@ def _machine_axis(axis: AxisSection) -> MachineAxis:
         rated_torque_Nm=axis.rated_torque_Nm,
         resolver_noise_counts=axis.emulation.resolver_noise_counts,
         output_delay_periods=axis.emulation.output_delay_periods,
+        resolver_eccentricity_counts=axis.emulation.resolver_eccentricity_counts,
+        resolver_eccentricity_rad=radians(axis.emulation.resolver_eccentricity_deg),
     )

@@ -7,7 +7,7 @@ the ticks never drift against the bus, and stand at the same nanoseconds in ever
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import floor, isfinite, pi
+from math import floor, isfinite, pi, sin
 from random import Random
 from typing import Final, NamedTuple, Protocol
 
@@ -88,7 +88,9 @@ class MachineAxis:
     ``torque_per_volt`` in N m / V is the amplifier's; ``rated_torque_Nm`` is what 1000 per mille are;
     ``resolver_noise_counts`` the standard deviation of the resolver's noise before it is quantised, 0 for none;
     ``output_delay_periods``: 1 where the controller's output acts one servo period after the position it was made from,
-    as in a drive that computes in between, 0 where it acts at once.
+    as in a drive that computes in between, 0 where it acts at once; ``resolver_eccentricity_counts``: amplitude of an
+    error once a revolution, of a rotor that does not run true, which passes zero rising at
+    ``resolver_eccentricity_rad``.
 
     Raises ValueError where a value is out of its bounds.
     """
@@ -99,6 +101,8 @@ class MachineAxis:
     resolver_noise_counts: float = 0.0
     demand_resolution: DemandResolution = DemandResolution.UNROUNDED_DIFFERENCE
     output_delay_periods: int = 0
+    resolver_eccentricity_counts: float = 0.0
+    resolver_eccentricity_rad: float = 0.0
 
     def __post_init__(self) -> None:
         if self.counts_per_revolution < 1:
@@ -106,8 +110,12 @@ class MachineAxis:
         for name, value in (("torque_per_volt", self.torque_per_volt), ("rated_torque_Nm", self.rated_torque_Nm)):
             if not (isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} = {value!r}, must be finite and positive")
-        if not (isfinite(self.resolver_noise_counts) and self.resolver_noise_counts >= 0.0):
-            raise ValueError(f"resolver_noise_counts = {self.resolver_noise_counts!r}, must be finite and zero or more")
+        for name, value in (
+            ("resolver_noise_counts", self.resolver_noise_counts),
+            ("resolver_eccentricity_counts", self.resolver_eccentricity_counts),
+        ):
+            if not (isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} = {value!r}, must be finite and zero or more")
         if self.output_delay_periods not in (0, 1):
             raise ValueError(f"output_delay_periods = {self.output_delay_periods!r}, must be 0 or 1")
 
@@ -136,6 +144,8 @@ class TickRecord(NamedTuple):
     demands_counts: tuple[float, ...]
     torque_commands_Nm: tuple[float, ...]
     torques_Nm: tuple[float, ...]
+    drawn_J: tuple[float, ...]
+    """Energy that the axis has drawn from its supply, see `AxisEnergy`."""
 
 
 class DriveTap(Protocol):
@@ -169,6 +179,7 @@ class _Motor:
         "delayed_torque",
         "drive",
         "due_ns",
+        "eccentricity",
         "events",
         "index",
         "is_powered",
@@ -191,6 +202,7 @@ class _Motor:
         self.counts_per_rad = axis.counts_per_revolution / (2.0 * pi)
         self.permille_per_Nm = 1000.0 / axis.rated_torque_Nm
         self.noise = 0.0
+        self.eccentricity = axis.resolver_eccentricity_counts
         self.counts = 0
         self.velocity = 0.0
         """Counts/s, over the last servo period."""
@@ -210,7 +222,10 @@ class _Motor:
 
     def quantise(self, angle_rad: float) -> int:
         """What the resolver shows at this angle."""
-        counts = floor(angle_rad * self.counts_per_rad + self.noise + 0.5)
+        reading = angle_rad * self.counts_per_rad + self.noise + 0.5
+        if self.eccentricity:
+            reading += self.eccentricity * sin(angle_rad - self.axis.resolver_eccentricity_rad)
+        counts = floor(reading)
         return counts if self.tap is None else self.tap.show(counts)
 
     def receive_through_tap(self, frame: Frame, now_ns: int) -> None:
@@ -418,10 +433,8 @@ class EmulatedMachine:
             axis = motor.axis
             if axis.resolver_noise_counts > 0.0:
                 motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
-            counts = floor(plant.angle(index) * motor.counts_per_rad + motor.noise + 0.5)
             tap = motor.tap
-            if tap is not None:
-                counts = tap.show(counts)
+            counts = motor.quantise(plant.angle(index))
             motor.velocity = velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
             motor.counts = counts
             drive.on_servo_tick(now_ns, counts, velocity)
@@ -521,9 +534,8 @@ class EmulatedMachine:
                 offset_s = 0.0
             elif offset_s > SERVO_PERIOD_S:
                 offset_s = SERVO_PERIOD_S
-            counts = floor(angle(index, offset_s) * motor.counts_per_rad + motor.noise + 0.5)
             return (
-                counts if motor.tap is None else motor.tap.show(counts),
+                motor.quantise(angle(index, offset_s)),
                 motor.velocity,
                 floor(torque(index) * motor.permille_per_Nm + 0.5),
             )
@@ -561,5 +573,6 @@ class EmulatedMachine:
                 tuple(drive.position_demand_counts for drive in self.drives),
                 tuple(self._torques),
                 tuple(self.plant.torque(axis) for axis in axes),
+                tuple(self.plant.axis_energy(axis).drawn for axis in axes),
             )
         )

@@ -423,7 +423,7 @@ def test_records_keep_the_last_ticks() -> None:
     bench.run_until(5 * 1_953_125 // 2)
     records = list(bench.machine.records)
     assert [record.at_ns for record in records] == [n * 1_953_125 // 2 for n in (3, 4, 5)]
-    assert records[-1] == TickRecord(4_882_812, (0.0, 0.0), (0, 0), (4.882812, 0.0), (0.0, 0.0), (0.0, 0.0))
+    assert records[-1] == TickRecord(4_882_812, (0.0, 0.0), (0, 0), (4.882812, 0.0), *((0.0, 0.0),) * 3)
     assert not Bench().machine.records
 
 
