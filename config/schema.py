@@ -234,6 +234,17 @@ class AxisSection(Model):
     emulation: EmulatedDriveSection
 
 
+class SyncSource(Enum):
+    """Who sends SYNC."""
+
+    AUTO = "auto"
+    """The kernel on SocketCAN, the loop elsewhere."""
+    KERNEL = "kernel"
+    """The broadcast manager of SocketCAN, from the kernel's own timer."""
+    LOOP = "loop"
+    """The cyclic loop, on absolute deadlines."""
+
+
 class BusSection(Model):
     """Where the drives are, and how often they are spoken to."""
 
@@ -244,6 +255,9 @@ class BusSection(Model):
     port: Annotated[int, Field(ge=0, le=65535)] = 29536
     bit_rate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
     cycle_us: Annotated[int, Field(ge=200, le=1_000_000)] = 1000
+    sync_source: SyncSource = SyncSource.AUTO
+    processor: Annotated[int, Field(ge=0, le=4095)] | None = None
+    """Processor that the cyclic loop is bound to; null: an isolated one if there is one, else none."""
     gateway_node_id: Annotated[int, Field(ge=1, le=MAX_NODE_ID)] = 127
     """Node id under which the gateway sends its own heartbeat."""
     heartbeat_ms: Annotated[int, Field(ge=1, le=30_000)] = 50

@@ -28,9 +28,9 @@ class ArrivalClock:
         self._time_of_day_ns = time_of_day_ns
         self._empty_ns = monotonic_ns()
 
-    def queue_is_empty(self) -> None:
-        """Note that no frame is waiting now, so that none can turn up that arrived earlier."""
-        self._empty_ns = self._monotonic_ns()
+    def queue_is_empty(self, at_ns: int | None = None) -> None:
+        """Note that no frame was waiting at ``at_ns``, or is now, so that none can turn up that arrived earlier."""
+        self._empty_ns = self._monotonic_ns() if at_ns is None else at_ns
 
     def arrival_ns(self, stamp_ns: int) -> int:
         """Monotonic instant of the arrival that ``stamp_ns`` (time of day) marks."""

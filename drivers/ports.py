@@ -30,6 +30,8 @@ class Port(Protocol):
     def receive(self) -> tuple[Frame, int] | None:
         """The oldest frame that has arrived and its arrival on the ``time.monotonic_ns`` clock; None if there is none.
 
+        None may also mean that there was none a moment ago, when the queue was read; ``wait`` then ends at once.
+
         Raises:
             BusError: the bus has gone away, or the controller has gone bus-off.
         """

@@ -5,6 +5,7 @@ import os
 import select
 import socket
 import struct
+import time
 from collections.abc import Sequence
 from enum import IntFlag
 from typing import Final
@@ -12,6 +13,7 @@ from typing import Final
 from drivers.arrival_clock import ArrivalClock
 from drivers.errors import BusError
 from drivers.frame import MAX_DATA_LENGTH, Frame
+from drivers.message_batch import MessageBatch
 
 # linux/can.h, linux/can/raw.h and asm-generic/socket.h; written out so that the module can be imported anywhere.
 _AF_CAN: Final = 29
@@ -28,11 +30,11 @@ _SO_RCVBUFFORCE: Final = 33
 _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
 
-_CAN_FRAME: Final = struct.Struct("=IB3x8s")
+CAN_FRAME: Final = struct.Struct("=IB3x8s")
+"""``struct can_frame``: identifier and flags, length, data."""
+_pack_frame: Final = CAN_FRAME.pack
+_unpack_frame: Final = CAN_FRAME.unpack_from
 _FILTER: Final = struct.Struct("=II")
-_TIMESPEC: Final = struct.Struct("@ll")
-_DROP_COUNT: Final = struct.Struct("@I")
-_ANCILLARY_BYTES: Final = 128
 _RECEIVE_BUFFER_BYTES: Final = 4 << 20
 _MAX_SKIPPED_FRAMES: Final = 64
 _QUEUE_FULL: Final = (errno.ENOBUFS, errno.EAGAIN)
@@ -60,17 +62,35 @@ class SocketcanPort:
     what they report, ``lost_frame_count`` the frames that the kernel had no room for; bus-off raises BusError.
     """
 
-    def __init__(self, channel: str, filters: Sequence[tuple[int, int]] | None = None) -> None:
+    def __init__(
+        self,
+        channel: str,
+        filters: Sequence[tuple[int, int]] | None = None,
+        carrier: socket.socket | None = None,
+    ) -> None:
         """Open the interface ``channel``; ``filters`` are pairs of COB-ID and mask, applied by the kernel.
+
+        ``carrier``: a socket that does not block and carries ``CAN_FRAME`` datagrams, in place of the interface.
 
         Raises:
             BusError: this kernel has no SocketCAN, there is no such interface, or it is down.
         """
         self.channel: Final = channel
         self.error_counts: Final = dict.fromkeys(BusErrorClass, 0)
-        self.lost_frame_count = 0
-        self._socket = self._open(channel, filters)
+        self.error_frame_count = 0
+        """Error frames, whatever they reported."""
+        self._socket = self._open(channel, filters) if carrier is None else carrier
         self._clock: Final = ArrivalClock()
+        self._batch: Final = MessageBatch(self._socket)
+        self._batch_count = 0
+        self._batch_next = 0
+        self._may_hold_more = True
+        self._empty_ns = 0
+
+    @property
+    def lost_frame_count(self) -> int:
+        """Frames that the kernel had no room for."""
+        return self._batch.drop_count
 
     def _open(self, channel: str, filters: Sequence[tuple[int, int]] | None) -> socket.socket:
         try:
@@ -110,11 +130,9 @@ class SocketcanPort:
 
     def send(self, frame: Frame) -> bool:
         """See Port."""
-        data = frame.data
+        cob_id, data, is_remote = frame
         try:
-            self._socket.send(
-                _CAN_FRAME.pack(frame.cob_id | _CAN_RTR_FLAG if frame.is_remote else frame.cob_id, len(data), data)
-            )
+            self._socket.send(_pack_frame(cob_id | _CAN_RTR_FLAG if is_remote else cob_id, len(data), data))
         except OSError as error:
             if error.errno in _QUEUE_FULL:
                 return False
@@ -124,30 +142,43 @@ class SocketcanPort:
     def receive(self) -> tuple[Frame, int] | None:
         """See Port."""
         for _ in range(_MAX_SKIPPED_FRAMES):
-            try:
-                packet, ancillary, _, _ = self._socket.recvmsg(_CAN_FRAME.size, _ANCILLARY_BYTES)
-            except BlockingIOError:
-                self._clock.queue_is_empty()
-                return None
-            except OSError as error:
-                raise self._lost(error) from None
-            identifier, length, data = _CAN_FRAME.unpack(packet)
-            stamp_ns = 0
-            for _, kind, value in ancillary:
-                if kind == _SO_TIMESTAMPNS:
-                    seconds, nanoseconds = _TIMESPEC.unpack(value)
-                    stamp_ns = seconds * 1_000_000_000 + nanoseconds
-                elif kind == _SO_RXQ_OVFL:
-                    (self.lost_frame_count,) = _DROP_COUNT.unpack(value)
-            if identifier & _CAN_ERR_FLAG:
+            number = self._batch_next
+            if number == self._batch_count:
+                number = 0
+                if not self._fetch():
+                    return None
+            self._batch_next = number + 1
+            identifier, length, data = _unpack_frame(self._batch.data, number << 4)
+            if identifier <= _CAN_SFF_MASK:
+                # Most frames by far are whole and plain.
+                frame = Frame(identifier, data if length == MAX_DATA_LENGTH else data[:length])
+            elif identifier & _CAN_ERR_FLAG:
                 self._count_error(identifier)
                 continue
-            if identifier & _CAN_RTR_FLAG:
-                frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
             else:
-                frame = Frame(identifier & _CAN_SFF_MASK, data[: min(length, MAX_DATA_LENGTH)])
-            return frame, self._clock.arrival_ns(stamp_ns)
+                frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
+            return frame, self._clock.arrival_ns(self._batch.stamp_ns(number))
         return None
+
+    def _fetch(self) -> bool:
+        """Fill the batch; False if nothing waits.
+
+        A batch that was not full has emptied the queue: nothing more is asked for before the next ``wait``.
+        """
+        self._batch_next = self._batch_count = 0
+        if self._may_hold_more:
+            try:
+                self._batch_count = self._batch.receive()
+            except OSError as error:
+                raise self._lost(error) from None
+            if self._batch_count < self._batch.capacity:
+                self._may_hold_more = False
+                self._empty_ns = time.monotonic_ns()
+            if self._batch_count:
+                return True
+        self._clock.queue_is_empty(self._empty_ns)
+        self._may_hold_more = True
+        return False
 
     def wait(self, timeout_s: float) -> bool:
         """See Port."""
@@ -165,6 +196,7 @@ class SocketcanPort:
         self._socket.close()
 
     def _count_error(self, identifier: int) -> None:
+        self.error_frame_count += 1
         for error_class in BusErrorClass:
             if identifier & error_class:
                 self.error_counts[error_class] += 1

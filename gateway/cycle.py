@@ -35,8 +35,9 @@ SYNC_PATIENCE: Final = 2
 """A SYNC that is late by this part of the period counts as missing."""
 SYNC_TAKE_OVER: Final = 3
 """After so many missing SYNCs in a row the loop sends them itself."""
-GRID_FILTER: Final = 16
-"""The SYNC's grid follows what comes late by this part of the lateness."""
+GRID_FILTER: Final = 2
+"""The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC, so
+that its grid slips by what each of them is late."""
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
 
@@ -302,7 +303,7 @@ class CyclicLoop:
         if self.missing_syncs:
             self._flags |= SampleFlag.SYNC_LOST
             self.missing_syncs = 0
-        # A timer is late, never early: the grid follows the earliest, and drifts slowly with what comes late.
+        # A timer is late, never early.
         late_ns = at_ns - self._sync_due_ns
         self._sync_due_ns += late_ns if late_ns < 0 else late_ns // GRID_FILTER
         self._begin(at_ns, deviation_ns)

@@ -15,17 +15,20 @@ from types import FrameType
 from typing import Final
 
 from config.loading import parse_config
+from config.schema import GatewayConfig
 from drivers.cia402 import COMMAND_QUICK_STOP
 from drivers.errors import BusError, DriveError
 from drivers.frame import Frame
 from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
 from drivers.node import Event
 from drivers.ports import Port
-from drivers.real_time import try_realtime
+from drivers.real_time import RealTimeSetting, try_realtime
 from gateway.bus_address import BusAddress
 from gateway.child_process import end_with
 from gateway.core import GatewayCore
 from gateway.cycle import RPDO_LAYOUT, SYNC_FRAME
+from gateway.cycle_bus import CycleBus, open_cycle_bus
+from gateway.cycle_host import CycleHost
 from gateway.errors import GatewayError
 from gateway.event_text import describe
 from gateway.guard import StopReason
@@ -33,7 +36,6 @@ from gateway.preparation import build_core, plan
 from gateway.ring import RingWriter, RunState, StopRequest
 from mechanism.cam_file import parse_cam_file
 
-MAX_WAIT_S: Final = 0.05
 LISTENING_S: Final = 0.5
 """How long the bus is listened to at least before anything is sent on it; a socketcand server may keep frames from a
 client for some tenths of a second after the greeting."""
@@ -59,44 +61,6 @@ class CyclicJob:
     def to_json(self) -> str:
         """The job as it is sent to the process."""
         return json.dumps(asdict(self))
-
-
-def run_core(core: GatewayCore, port: Port, clock: Callable[[], int], poll: Callable[[], None]) -> None:
-    """Drive the gateway's core by the clock until it is done; ``poll`` is called at least once a cycle.
-
-    Unlike the emulator's host, which gives every wake the instant it was due, this one tells the core the time that it
-    really is: the gateway's account is about how late things are.
-
-    Raises BusError when the bus has gone.
-    """
-    loop = core.loop
-    latest_ns = clock()
-    while not core.is_done:
-        received = port.receive()
-        if received is not None:
-            frame, arrival_ns = received
-            due_ns = core.next_wake_ns()
-            if due_ns is not None and due_ns < arrival_ns:
-                latest_ns = max(latest_ns, clock())
-                core.wake(latest_ns)
-            latest_ns = max(latest_ns, arrival_ns)
-            core.receive(frame, latest_ns)
-        else:
-            now_ns = clock()
-            due_ns = core.next_wake_ns()
-            if due_ns is not None and due_ns > now_ns:
-                poll()
-                port.wait(min((due_ns - now_ns) * 1e-9, MAX_WAIT_S))
-                continue
-            latest_ns = max(latest_ns, now_ns)
-            core.wake(latest_ns)
-        frames = core.take_frames()
-        if frames:
-            for frame in frames:
-                port.send(frame)
-            loop.sent(clock())
-            # A loop that is always late never waits, and must hear of a stop all the same.
-            poll()
 
 
 def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None:
@@ -140,16 +104,40 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
     port.send(SYNC_FRAME)
 
 
-def run_guarded(core: GatewayCore, port: Port, poll: Callable[[], None]) -> None:
-    """``run_core`` by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
+def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None]) -> None:
+    """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
     try:
-        run_core(core, port, time.monotonic_ns, poll)
+        CycleHost(core, bus.cyclic, poll, service=bus.service, sync=bus.sync).run()
     except BusError:
         raise
     except Exception:
         if core.loop.is_running:
-            stop_drives(core, port)
+            stop_drives(core, bus.cyclic)
         raise
+
+
+def tell_setting(ring: RingWriter, setting: RealTimeSetting) -> None:
+    """What keeps the loop on time is an event of the run: on or off, and why."""
+    state = "on" if setting.is_on else "off"
+    text = f"{setting.feature.value} {state}: {setting.reason}"
+    ring.append_event(time.monotonic_ns(), "realtime", text, is_on=setting.is_on)
+
+
+def join_bus(address: BusAddress, config: GatewayConfig, ring: RingWriter) -> CycleBus:
+    """Listen whether the bus is free, and open what the cycle needs. Raises BusError and GatewayError."""
+    listener = address.open()
+    try:
+        for setting in try_realtime(processor=config.bus.processor):
+            tell_setting(ring, setting)
+        refuse_other_master(listener, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
+        bus = open_cycle_bus(address, config, listener)
+    except BaseException:
+        listener.close()
+        raise
+    if bus.cyclic is not listener:
+        listener.close()
+    tell_setting(ring, bus.sync_setting)
+    return bus
 
 
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
@@ -179,21 +167,12 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         answered = pass_on_stop(core, ring.stop_request(), answered)
 
     address = BusAddress(job.interface, job.channel, job.host, job.port, job.bit_rate)
-    port: Port | None = None
+    bus: CycleBus | None = None
     stopped_by = StopReason.BUS_LOST
     try:
-        port = address.open()
-        for setting in try_realtime():
-            state = "on" if setting.is_on else "off"
-            ring.append_event(
-                time.monotonic_ns(),
-                "realtime",
-                f"{setting.feature.value} {state}: {setting.reason}",
-                is_on=setting.is_on,
-            )
-        refuse_other_master(port, config.bus.gateway_node_id, max(LISTENING_S, 2.5 * config.cycle_s))
+        bus = join_bus(address, config, ring)
         ring.set_state(RunState.RUNNING)
-        run_guarded(core, port, poll)
+        run_guarded(core, bus, poll)
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:
@@ -201,8 +180,8 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     except GatewayError as error:
         failure, stopped_by = error, StopReason.COMMISSIONING
     finally:
-        if port is not None:
-            port.close()
+        if bus is not None:
+            bus.close()
     poll()
     if failure is not None:
         for sentence in str(failure).splitlines():

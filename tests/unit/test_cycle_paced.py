@@ -137,7 +137,7 @@ def test_the_grid_follows_the_earliest_sync_and_a_gap_is_an_overrun():
     rows = bench.sink.rows
     assert [row["deviation"] for row in rows] == [100_000 - MS, -70_000, 0, 2 * MS + 16_000]
     assert rows[3]["flags"] == SampleFlag.OVERRUN
-    assert bench.loop.sync_due_ns == 7 * MS + 30_000, "one sixteenth of 16 us late, and then 1 us early again"
+    assert bench.loop.sync_due_ns == 7 * MS + 30_000, "half of 16 us late, and then 8 us early again"
 
 
 def test_a_missing_sync_is_flagged_and_after_three_the_loop_sends_it_itself():

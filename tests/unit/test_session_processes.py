@@ -13,7 +13,8 @@ import pytest
 from config.loading import load_config
 from drivers.frame import Frame
 from gateway.bus_address import resolve_bus
-from gateway.cyclic_process import pass_on_stop, refuse_other_master, run_core
+from gateway.cycle_host import run_core
+from gateway.cyclic_process import pass_on_stop, refuse_other_master
 from gateway.errors import GatewayError
 from gateway.ring import StopRequest
 from gateway.session import StopSwitch
@@ -63,6 +64,9 @@ def test_a_stop_request_is_handed_on_once():
 
 class LateCore:
     """A core that is due for ever, as one on an overloaded host; ends after so many wakes."""
+
+    is_running = is_closed = is_paced = False
+    arrival_offset_ns = sync_due_ns = 0
 
     def __init__(self, wakes):
         self.left = wakes

@@ -128,6 +128,7 @@ def test_error_frames_are_counted_and_bus_off_is_a_lost_bus(port: SocketcanPort,
     assert port.error_counts[BusErrorClass.CONTROLLER] == 2
     assert port.error_counts[BusErrorClass.NO_ACKNOWLEDGE] == 2
     assert port.error_counts[BusErrorClass.BUS_OFF] == 0
+    assert port.receive() is None
     raw.send(RAW.pack(CAN_ERR_FLAG | BusErrorClass.BUS_OFF, 8, b""))
     assert port.wait(PATIENCE_S)
     with pytest.raises(BusError, match="socketcan:vcan0: the controller has gone bus-off"):

@@ -1,0 +1,187 @@
+"""The gateway's host on buses, a clock and a sleep that are not real."""
+
+import pytest
+import yaml
+
+from config.loading import load_config, parse_config
+from config.schema import SyncSource
+from drivers.errors import BusError
+from drivers.frame import Frame
+from drivers.nmt import SYNC_COB_ID
+from drivers.real_time import isolated_processors
+from gateway import cycle_bus
+from gateway.bus_address import BusAddress
+from gateway.cycle_bus import open_cycle_bus
+from gateway.cycle_host import CycleHost
+from gateway.errors import GatewayError
+from gateway.preparation import build_core, prepare
+from gateway.sample import SampleFlag
+
+MS = 1_000_000
+CONFIG = load_config("paper")
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    return prepare(CONFIG, 1)
+
+
+class Samples:
+    def __init__(self):
+        self.flags = []
+        self.leads = []
+
+    def append(self, *values):
+        self.flags.append(values[13])
+        self.leads.append(values[10])
+
+
+class World:
+    """Time, a bus on which two drives answer SYNC after 0.2 and 0.3 ms, and a kernel that sends SYNC."""
+
+    def __init__(self, prepared, is_kernel, full_sends=()):
+        self.now_ns = 0
+        self.queue = []
+        self.sent = []
+        self.sleeps = self.waits = self.polls = 0
+        self.full_sends = set(full_sends)
+        self.sync_period = None
+        self.next_sync_ns = None
+        self.samples = Samples()
+        self.core = build_core(CONFIG, prepared.cam.profile, prepared.plan, self.samples)
+        self.core._session = iter(lambda: 1 << 62, None)  # the session waits for ever: the cycle alone is looked at
+        self.core.loop.start(0)
+        self.host = CycleHost(
+            self.core, self, self.poll, sync=self if is_kernel else None, clock=lambda: self.now_ns, sleep=self.sleep
+        )
+
+    # the kernel's SYNC
+    def start(self):
+        self.next_sync_ns = self.now_ns + 10_000
+
+    def stop(self):
+        self.next_sync_ns = None
+
+    # the bus
+    def send(self, frame):
+        self.now_ns += 5_000
+        if len(self.sent) in self.full_sends:
+            self.full_sends.discard(len(self.sent))
+            return False
+        self.sent.append((self.now_ns, frame))
+        if frame.cob_id == SYNC_COB_ID:
+            self.answer(self.now_ns)
+        return True
+
+    def answer(self, sync_ns):
+        for number in (1, 2):
+            self.queue.append((sync_ns + 100_000 * (number + 1), Frame(0x180 + number, bytes(8))))
+
+    def receive(self):
+        self.pass_time(self.now_ns)
+        if self.queue and self.queue[0][0] <= self.now_ns:
+            at_ns, frame = self.queue.pop(0)
+            return frame, at_ns
+        return None
+
+    def pass_time(self, to_ns):
+        while self.next_sync_ns is not None and self.next_sync_ns <= to_ns:
+            self.queue.append((self.next_sync_ns, Frame(SYNC_COB_ID)))
+            self.answer(self.next_sync_ns)
+            self.next_sync_ns += MS
+        self.queue.sort(key=lambda entry: entry[0])
+        self.now_ns = max(self.now_ns, to_ns)
+
+    def wait(self, timeout_s):
+        self.waits += 1
+        end_ns = self.now_ns + round(timeout_s * 1e9)
+        coming = [at_ns for at_ns, _ in self.queue] + ([self.next_sync_ns] if self.next_sync_ns else [])
+        self.pass_time(min([end_ns, *coming]))
+        return self.now_ns < end_ns
+
+    def sleep(self, span_s):
+        self.sleeps += 1
+        self.pass_time(self.now_ns + round(span_s * 1e9) + 2_000)
+
+    def poll(self):
+        self.polls += 1
+        if self.core.loop.cycle >= 200:
+            self.core.loop.stop()
+            self.core.is_done = True
+
+
+@pytest.mark.parametrize("is_kernel", [True, False])
+def test_the_loop_learns_when_to_wake_and_sleeps_as_little_as_once_a_cycle(prepared, is_kernel):
+    world = World(prepared, is_kernel)
+    world.host.run()
+    assert world.samples.flags == [0] * 200
+    # The last TPDO comes after 0.3 ms, and is 2 us late in being read; the margin is 15 us.
+    assert 300_000 <= world.host.phase_ns <= 320_000
+    sleeps = world.sleeps / 200
+    assert sleeps < (1.1 if is_kernel else 2.1), "SYNC itself is a second wake where the loop sends it"
+    assert world.waits < 80, "until the phase is known"
+    syncs = [at_ns for at_ns, frame in world.sent if frame.cob_id == SYNC_COB_ID]
+    assert len(syncs) == (0 if is_kernel else 201)
+    assert world.next_sync_ns is None, "the kernel's SYNC ends with the session"
+    # RPDOs leave some 15 us after the phase: 0.68 ms are left.
+    assert 650_000 < sorted(world.samples.leads)[100] < 690_000
+
+
+def test_a_full_buffer_is_offered_the_frame_again_and_counted(prepared):
+    world = World(prepared, True, full_sends=[21, 40])
+    world.host.run()
+    full = [n for n, flags in enumerate(world.samples.flags) if flags & SampleFlag.SEND_BUFFER_FULL]
+    assert len(full) == 2
+    assert not any(flags & SampleFlag.MISSED_RPDO_DEADLINE for flags in world.samples.flags)
+    demands = [frame.cob_id for _, frame in world.sent]
+    assert demands.count(0x201) == demands.count(0x202)
+
+
+def test_a_demand_that_never_got_onto_the_bus_has_missed_its_deadline(prepared):
+    world = World(prepared, True)
+    send, world.send = world.send, lambda frame: (world.now_ns // MS) % 50 != 20 and send(frame)
+    world.host.run()
+    missed = [n for n, flags in enumerate(world.samples.flags) if flags & SampleFlag.MISSED_RPDO_DEADLINE]
+    assert len(missed) == 4
+
+
+@pytest.mark.parametrize(("text", "expected"), [("", []), ("2", [2]), ("1,4-6\n", [1, 4, 5, 6]), ("x", [])])
+def test_isolated_processors_as_the_kernel_lists_them(tmp_path, text, expected):
+    (tmp_path / "isolated").write_text(text)
+    assert isolated_processors(tmp_path) == expected
+
+
+def with_source(source):
+    document = yaml.safe_load(CONFIG.text)
+    document["bus"]["sync_source"] = source.value
+    return parse_config(yaml.safe_dump(document), CONFIG.path)
+
+
+def test_the_kernels_sync_on_a_bus_without_one_is_refused():
+    address = BusAddress("socketcand", "vcan0", "127.0.0.1", 29536)
+    with pytest.raises(GatewayError, match=r"bus\.sync_source: kernel needs the interface socketcan, this bus is"):
+        open_cycle_bus(address, with_source(SyncSource.KERNEL), None)
+    bus = open_cycle_bus(address, with_source(SyncSource.AUTO), world := object())
+    assert bus.cyclic is world
+    assert bus.sync is None
+    assert not bus.sync_setting.is_on
+
+
+@pytest.mark.parametrize("source", list(SyncSource))
+def test_without_a_broadcast_manager_auto_falls_back_to_the_loop(monkeypatch, source):
+    def refuse(channel, *_):
+        raise BusError("socketcan", channel, "this system offers no CAN broadcast manager")
+
+    monkeypatch.setattr(cycle_bus, "PeriodicFrame", refuse)
+    opened = []
+    monkeypatch.setattr(BusAddress, "open", lambda _self, filters: opened.append(filters) or object())
+    address = BusAddress("socketcan", "can0", "", 0)
+    if source is SyncSource.KERNEL:
+        with pytest.raises(BusError):
+            open_cycle_bus(address, with_source(source), None)
+        return
+    bus = open_cycle_bus(address, with_source(source), None)
+    assert bus.sync is None
+    cyclic, service = opened
+    assert cyclic == [(0x181, 0x7FF), (0x182, 0x7FF)], "its own SYNC is not for the loop"
+    assert {cob_id for cob_id, _ in service} == {0x081, 0x581, 0x701, 0x082, 0x582, 0x702}

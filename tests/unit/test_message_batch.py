@@ -1,0 +1,134 @@
+"""The SocketCAN port over sockets that every system has: batches, time stamps, what is skipped."""
+
+import socket
+import time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.broadcast_manager import PeriodicFrame
+from drivers.errors import BusError
+from drivers.frame import Frame
+from drivers.message_batch import MessageBatch
+from drivers.socketcan_port import CAN_FRAME, BusErrorClass, SocketcanPort
+
+SO_TIMESTAMPNS = 35
+
+
+@pytest.fixture
+def pair():
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    near.setblocking(False)
+    near.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+    with far, near:
+        yield far, near
+
+
+def received(port):
+    """The next frame; the first None may be about the moment at which the queue was last read."""
+    one = port.receive() or port.receive()
+    return None if one is None else one[0]
+
+
+def raw(identifier, data=b""):
+    return CAN_FRAME.pack(identifier, len(data), data)
+
+
+def test_frames_come_in_order_with_the_instant_at_which_the_kernel_took_them(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    assert port.receive() is None
+    before = time.monotonic_ns()
+    for number in range(40):  # more than two batches
+        far.send(raw(0x181 + number % 3, bytes((number,) * (number % 9))))
+    after = time.monotonic_ns()
+    heard = []
+    while (one := port.receive()) is not None:
+        heard.append(one)
+    assert [frame for frame, _ in heard] == [Frame(0x181 + n % 3, bytes((n,) * (n % 9))) for n in range(40)]
+    instants = [at_ns for _, at_ns in heard]
+    # The stamp is of another clock, read one after the other: a few microseconds.
+    assert all(before - 200_000 <= at_ns <= after + 200_000 for at_ns in instants)
+    assert port.receive() is None
+
+
+def test_what_waits_behind_an_exactly_full_batch_is_not_left_there(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    for count in (16, 17, 32, 1):
+        for number in range(count):
+            far.send(raw(0x200 + number))
+        assert [received(port).cob_id for _ in range(count)] == [0x200 + number for number in range(count)]
+        assert port.receive() is None
+
+
+def test_a_frame_that_came_after_the_queue_was_empty_is_found(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    far.send(raw(0x181))
+    assert port.receive() is not None
+    assert port.receive() is None
+    far.send(raw(0x182))
+    assert received(port).cob_id == 0x182
+
+
+def test_error_and_remote_frames_are_told_apart(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    far.send(raw(0x20000000 | BusErrorClass.NO_ACKNOWLEDGE | BusErrorClass.BUS_ERROR, bytes(8)))
+    far.send(raw(0x40000000 | 0x701))
+    assert received(port) == Frame(0x701, b"", True)
+    assert port.error_frame_count == 1
+    assert port.error_counts[BusErrorClass.NO_ACKNOWLEDGE] == 1
+    far.send(raw(0x20000000 | BusErrorClass.BUS_OFF, bytes(8)))
+    with pytest.raises(BusError, match="bus-off"):
+        received(port)
+
+
+def test_a_socket_without_stamps_says_so_with_zero():
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with far, near:
+        near.setblocking(False)
+        batch = MessageBatch(near, 4)
+        assert batch.receive() == 0
+        far.send(b"abc")
+        assert batch.receive() == 1
+        assert (batch.stamp_ns(0), batch.length(0), bytes(batch.data[:3])) == (0, 3, b"abc")
+
+
+def test_a_socket_that_is_gone_is_an_error():
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    near.setblocking(False)
+    port = SocketcanPort("pair", carrier=near)
+    near.close()
+    far.close()
+    with pytest.raises(BusError, match="the interface has failed"):
+        port.receive()
+
+
+@settings(max_examples=30)
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=10))
+def test_whatever_the_bursts_nothing_is_lost_or_told_twice(bursts):
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with far, near:
+        near.setblocking(False)
+        port = SocketcanPort("pair", carrier=near)
+        count = heard = 0
+        for burst in bursts:
+            for _ in range(burst):
+                far.send(raw(count & 0x7FF))
+                count += 1
+            # Not always to the end: what is left must come next time.
+            for _ in range(burst - burst // 3):
+                assert received(port).cob_id == heard & 0x7FF
+                heard += 1
+        while (one := received(port)) is not None:
+            assert one.cob_id == heard & 0x7FF
+            heard += 1
+        assert heard == count
+
+
+def test_no_broadcast_manager_is_one_sentence():
+    with pytest.raises(BusError, match=r"nosuchcan9: (this system offers no CAN broadcast manager|the broadcast)"):
+        PeriodicFrame("nosuchcan9", Frame(0x080), 1000)
