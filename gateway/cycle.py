@@ -36,8 +36,8 @@ SYNC_PATIENCE: Final = 2
 SYNC_TAKE_OVER: Final = 3
 """After so many missing SYNCs in a row the loop sends them itself."""
 GRID_FILTER: Final = 2
-"""The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC, and
-its grid slips by what each of them is late."""
+"""The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC,
+and its grid slips by what each of them is late."""
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
 
