@@ -58,8 +58,8 @@ _TICK_NS: Final = 0
 _TICK: Final = 1
 _LINE_START_NS: Final = 2
 _CLOCK_COUNT: Final = 4
-_TICK_COLUMNS: Final = 4
-"""Of a recorded servo tick, each axis: counts, demand in counts, torque command in N m, amplifier torque in N m."""
+_TICK_COLUMNS: Final = 5
+"""Of a recorded servo tick, each axis: counts, demand in counts; torque command, torque and torque offset in N m."""
 
 _AXES: Final = 2
 _NS_PER_S: Final = 1_000_000_000
@@ -139,7 +139,7 @@ def advance_to_sync(
     """Run every servo tick that is due before ``sync_ns``; False if the linkage tore.
 
     ``noise`` (n, 2): the resolvers' noise in counts at tick ``first_tick`` + 1 and after, empty for none. ``ticks``
-    (n, 2, 4) takes those ticks, empty for nothing. Of what `ClosedLoop` holds, state, memory and clock are changed.
+    (n, 2, 5) takes those ticks, empty for nothing. Of what `ClosedLoop` holds, state, memory and clock are changed.
     """
     while True:
         number = clock[_TICK] + 1
@@ -180,6 +180,7 @@ def advance_to_sync(
                 ticks[row, axis, 1] = demand
                 ticks[row, axis, 2] = command
                 ticks[row, axis, 3] = plant_state[6 + axis]
+                ticks[row, axis, 4] = memory[axis, _TORQUE_OFFSET]
 
 
 @kernel
@@ -298,7 +299,10 @@ class ClosedLoopRun:
     error_counts: Int
     is_torn: bool
     ticks: Float
-    """(m, 2, 4): counts, demand, torque command and torque at every servo tick; empty unless asked for."""
+    """(m, 2, 5): counts, demand (counts), torque command, torque and torque offset (N m) at every servo tick.
+
+    The command has the offset in it. Empty unless asked for.
+    """
 
 
 class ClosedLoop:
