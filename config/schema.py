@@ -5,8 +5,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from config.guard_section import GuardSection
+from config.model import Model
 from config.quirks import Quirk
 from drivers.frame import WORST_CASE_BITS
 from drivers.nmt import MAX_NODE_ID
@@ -21,12 +23,6 @@ Positive = Annotated[float, Field(gt=0.0, le=1e6)]
 NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
 Point = Annotated[tuple[float, float], Field()]
 AxisName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
-
-
-class Model(BaseModel):
-    """Base of every section: frozen, no unknown keys, no NaN, no silent conversion from text."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=False)
 
 
 class FiveBarSection(Model):
@@ -105,6 +101,8 @@ class LimitsSection(Model):
     acceleration_rad_per_s2: Positive
     jerk_rad_per_s3: Positive | None = None
     following_error_counts: Annotated[int, Field(ge=1, le=0x7FFFFFFF)]
+    quick_stop_deceleration_rad_per_s2: Positive | None = None
+    """Of the drive's own ramp (6085h) in a quick stop and after a fault; null leaves what the drive has."""
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -278,32 +276,6 @@ class BusSection(Model):
         return bits / self.bit_rate / (self.cycle_us * 1e-6)
 
 
-class Reaction(Enum):
-    """What the gateway does when a guarded condition holds."""
-
-    WARN = "warn"
-    CONTROLLED_STOP = "controlled_stop"
-    QUICK_STOP = "quick_stop"
-
-
-class ConditionSection(Model):
-    """A guarded condition: how many cycles in a row it must hold, and what is then done."""
-
-    persistence_cycles: Annotated[int, Field(ge=1, le=100_000)] = 1
-    reaction: Reaction
-
-
-class GuardSection(Model):
-    """Every condition that the cycle watches, each with one reaction."""
-
-    following_error: ConditionSection = ConditionSection(persistence_cycles=1, reaction=Reaction.QUICK_STOP)
-    missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=Reaction.CONTROLLED_STOP)
-    missed_deadline: ConditionSection = ConditionSection(persistence_cycles=20, reaction=Reaction.CONTROLLED_STOP)
-    emergency: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
-    drive_fault: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
-    heartbeat_lost: ConditionSection = ConditionSection(reaction=Reaction.QUICK_STOP)
-
-
 class NominalLinksSection(Model):
     """Links as the feed-forward's model has them; what is left out is the machine's."""
 
@@ -433,6 +405,15 @@ class GatewayConfig(Model):
                 f"bus.cycle_us: {self.bus.cycle_us} us is too short for {len(self.axes)} axes at "
                 f"{self.bus.bit_rate} bit/s, SYNC and PDOs would take {load:.0%} of it (bound {MAX_BUS_LOAD:.0%})"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _guard_can_trip(self) -> Self:
+        self.guard.check_cycle(self.bus.cycle_us, self.bus.heartbeat_timeout_ms)
+        for name, axis in self.axes.items():
+            self.guard.check_axis(name, axis.counts_per_revolution, axis.limits.following_error_counts)
+            links = self.machine.five_bar
+            self.guard.check_end_effector(links.p_mm + links.q_mm, axis.counts_per_revolution)
         return self
 
     @model_validator(mode="after")

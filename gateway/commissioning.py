@@ -27,6 +27,9 @@ DEVICE_PROFILE_402: Final = 0x0192
 """Low word of 1000h of every CiA 402 drive."""
 ABORT_CONNECTION_FAULT: Final = 1
 """6007h: a drive that loses the gateway goes into a fault, and so stops."""
+QUICK_STOP_RAMP: Final = 2
+"""605Ah and 605Eh: a drive that is told to stop quickly, or faults with its amplifier whole, stops with the ramp 6085h
+and is without torque then; so the other axis can follow it, and a brake takes hold of an axis that stands."""
 PDO_COUNT: Final = 4
 U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
@@ -55,6 +58,10 @@ class NodeSettings:
     """Counts, 6065h."""
     rated_torque_mNm: int
     counts_per_revolution: int
+    quick_stop_deceleration: int | None = None
+    """Counts/s^2, 6085h; None: as the drive has it."""
+    torque_limit_permille: int | None = None
+    """Where the gateway's guard trips; a drive that gives no more than that (6072h) is refused. None: not checked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +137,10 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
     yield from _write_if_there(master, node_id, objects.COMMUNICATION_CYCLE_PERIOD, U32, network.cycle_us)
     yield from master.write(node_id, objects.FOLLOWING_ERROR_WINDOW, 0, U32, node.following_error_window)
     yield from _write_if_there(master, node_id, objects.ABORT_CONNECTION_OPTION_CODE, I16, ABORT_CONNECTION_FAULT)
+    for option in (objects.QUICK_STOP_OPTION_CODE, objects.FAULT_REACTION_OPTION_CODE):
+        yield from _write_if_there(master, node_id, option, I16, QUICK_STOP_RAMP)
+    if node.quick_stop_deceleration is not None:
+        yield from master.write(node_id, objects.QUICK_STOP_DECELERATION, 0, U32, node.quick_stop_deceleration)
     rated = yield from _read_if_there(master, node_id, objects.MOTOR_RATED_TORQUE, 0)
     increments = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 1)
     revolutions = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 2)

@@ -187,7 +187,8 @@ class GatewayCore:
             return
         for event in events:
             if isinstance(event, EmergencyReceived) and event.code:
-                self._guard.hold(Condition.EMERGENCY, self._axis_of_node[event.node_id], event.code, 0, now_ns)
+                condition = self._guard.emergency_condition(event.code)
+                self._guard.hold(condition, self._axis_of_node[event.node_id], event.code, 0, now_ns)
             elif isinstance(event, (HeartbeatLost, BootUpReceived)) or (
                 isinstance(event, NodeStateChanged) and event.state is not NmtState.OPERATIONAL
             ):

@@ -12,16 +12,20 @@ from collections.abc import Callable
 from operator import attrgetter
 from typing import Final, Protocol
 
-from config.schema import Reaction
+from config.guard_section import Reaction
 from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.object_dictionary import DataType
-from drivers.pdo import RPDO_BASE, TPDO_BASE, PdoLayout
+from drivers.pdo import PdoLayout
+from gateway.axis_channel import AxisChannel
 from gateway.demand import Demand
 from gateway.guard import Condition, Guard
+from gateway.reactions import CoupledStop
 from gateway.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
-from gateway.units import HALF_RANGE, RANGE_MASK, AxisUnits
+from gateway.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
+
+__all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop", "SampleSink"]
 
 RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
 """Controlword, target position, torque offset."""
@@ -38,8 +42,6 @@ SYNC_TAKE_OVER: Final = 3
 GRID_FILTER: Final = 2
 """The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC,
 and its grid slips by what each of them is late."""
-STATUSWORD_STATE_MASK: Final = 0x6F
-STATUSWORD_OPERATION_ENABLED: Final = 0x27
 
 
 # Looked up once: the cycle needs them a thousand times a second and more.
@@ -61,39 +63,6 @@ class SampleSink(Protocol):
         ...
 
 
-class AxisChannel:
-    """One axis as the cycle sees it: what it sends to the drive and what came back last."""
-
-    __slots__ = (
-        "actual",
-        "controlword",
-        "following_error_limit",
-        "name",
-        "node_id",
-        "rpdo_cob_id",
-        "statusword",
-        "target",
-        "torque",
-        "torque_offset",
-        "tpdo_cob_id",
-        "units",
-    )
-
-    def __init__(self, name: str, node_id: int, units: AxisUnits, following_error_limit: int) -> None:
-        self.name = name
-        self.node_id = node_id
-        self.units = units
-        self.following_error_limit = following_error_limit
-        self.rpdo_cob_id = RPDO_BASE[0] + node_id
-        self.tpdo_cob_id = TPDO_BASE[0] + node_id
-        self.controlword = COMMAND_DISABLE_VOLTAGE
-        self.target = 0
-        self.torque_offset = 0
-        self.statusword = 0
-        self.actual = 0
-        self.torque = 0
-
-
 _Sent = tuple[float, float, list[float], list[int], list[int], Phase]
 """A demand: master position, master velocity, velocities, targets, torque offsets, phase. Its lists are not changed."""
 
@@ -111,6 +80,7 @@ class CyclicLoop:
         "_applied",
         "_arrival_ns",
         "_awaited",
+        "_coupled_stop",
         "_cpu_clock",
         "_cpu_last_ns",
         "_cpu_ns",
@@ -120,6 +90,7 @@ class CyclicLoop:
         "_flags",
         "_in_force",
         "_is_closed",
+        "_is_coupled_stop_due",
         "_is_taken",
         "_no_torque_offsets",
         "_no_velocities",
@@ -132,6 +103,7 @@ class CyclicLoop:
         "_sync_ns",
         "_sync_period_ns",
         "_wake_lateness_ns",
+        "_watch",
         "actuals_are_valid",
         "axes",
         "cycle",
@@ -143,6 +115,7 @@ class CyclicLoop:
         "outbox",
         "period_ns",
         "phase",
+        "sync_gap_limit",
         "tpdo_slots",
     )
 
@@ -154,10 +127,14 @@ class CyclicLoop:
         sink: SampleSink,
         cpu_clock: Callable[[], int] | None = None,
         tpdo_deadline_ns: int | None = None,
+        watch: CycleWatch | None = None,
+        coupled_stop: CoupledStop | None = None,
     ) -> None:
         """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0.
 
         ``tpdo_deadline_ns``: how long after SYNC the TPDOs are waited for; None is ``TPDO_DEADLINE`` of the period.
+        ``watch`` is what every cycle is compared with, ``coupled_stop`` how a machine whose axes depend on each other
+        makes a quick stop; without the latter every drive makes its own.
         """
         self.axes = axes
         self.period_ns = period_ns
@@ -174,7 +151,12 @@ class CyclicLoop:
         self.phase = Phase.COMMISSIONING
         self.is_guarding_enabled = False
         """Set while all drives are meant to be in Operation enabled."""
+        self.sync_gap_limit = INT32_MAX
+        """So many SYNCs in a row that were not sent are a condition of the guard's; so is a timer that sends none."""
         self.tpdo_slots = {axis.tpdo_cob_id: number for number, axis in enumerate(axes)}
+        self._watch = watch or CycleWatch(guard, axes)
+        self._coupled_stop = coupled_stop
+        self._is_coupled_stop_due = False
         self._sink = sink
         self._cpu_clock = cpu_clock
         self._cpu_ns = 0
@@ -237,13 +219,27 @@ class CyclicLoop:
             self._demand.controlled_stop()
 
     def quick_stop(self) -> None:
-        """Quick stop on every drive; the demand is left behind. Does nothing to drives that are being disabled."""
-        if self.phase in {Phase.QUICK_STOP, Phase.DISABLED}:
+        """Stop as fast as the drives can, and take the torque from the axes that the guard has disabled.
+
+        The demand is left behind; a machine in motion whose axes depend on each other makes a coupled stop. Does
+        nothing to drives that are being disabled.
+        """
+        if self.phase is Phase.DISABLED:
             return
-        self.is_guarding_enabled = False
-        self.command(COMMAND_QUICK_STOP)
-        self._demand = None
-        self.phase = Phase.QUICK_STOP
+        if self.phase is not Phase.QUICK_STOP:
+            self.is_guarding_enabled = False
+            is_coupled = self._coupled_stop is not None and self._demand is not None
+            # It begins with the actual values of the cycle that is closed next.
+            self._is_coupled_stop_due = is_coupled
+            self._demand = None
+            self.phase = Phase.QUICK_STOP
+            if not is_coupled:
+                self.command(COMMAND_QUICK_STOP)
+        disabled = self.guard.disabled
+        if disabled:
+            for number, axis in enumerate(self.axes):
+                if disabled >> number & 1:
+                    axis.controlword = COMMAND_DISABLE_VOLTAGE
 
     # -- the cycle -----------------------------------------------------------------------------------------------
 
@@ -298,6 +294,7 @@ class CyclicLoop:
         if lost > 0:
             self._sync_due_ns += lost * self.period_ns
             self._flags = int(SampleFlag.OVERRUN)
+            self._lose_syncs(lost, at_ns)
         else:
             self._flags = 0
         if self.missing_syncs:
@@ -360,8 +357,13 @@ class CyclicLoop:
         if self.missing_syncs >= SYNC_TAKE_OVER:
             # Without SYNC no drive takes a demand, not even that of a stop.
             self.is_paced = False
+            self._lose_syncs(max(self.missing_syncs, self.sync_gap_limit), now_ns)
             self._sync_due_ns = now_ns
             self._send_sync(now_ns)
+
+    def _lose_syncs(self, count: int, now_ns: int) -> None:
+        if count >= self.sync_gap_limit and self.phase is not _COMMISSIONING:
+            self.guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
 
     def _send_sync(self, now_ns: int) -> None:
         lateness_ns = now_ns - self._sync_due_ns
@@ -377,7 +379,9 @@ class CyclicLoop:
         if lateness_ns >= self.period_ns:
             # Lost cycles are not made up for: two SYNCs at once would be worse for the drives than a gap.
             self._flags |= int(SampleFlag.OVERRUN)
-            self._sync_due_ns += lateness_ns // self.period_ns * self.period_ns
+            lost = lateness_ns // self.period_ns
+            self._sync_due_ns += lost * self.period_ns
+            self._lose_syncs(lost, now_ns)
         self._begin(now_ns, lateness_ns)
         self._wake_lateness_ns = lateness_ns
 
@@ -407,6 +411,8 @@ class CyclicLoop:
             self._applied = self._sent
         if self.phase is not _COMMISSIONING:
             self._check(now_ns)
+        if self._is_coupled_stop_due:
+            self._begin_coupled_stop()
         demand = self._demand
         if demand is None:
             for axis in self.axes:
@@ -437,38 +443,23 @@ class CyclicLoop:
             outbox.append(Frame(axis.rpdo_cob_id, payload))
 
     def _check(self, now_ns: int) -> None:
-        guard = self.guard
-        targets = self._in_force[3]
-        for number, axis in enumerate(self.axes):
-            if self._awaited >> number & 1:
-                self._hold_cycles(Condition.MISSED_TPDO, number, now_ns)
-                continue
-            if not guard.is_quiet:
-                guard.clear(Condition.MISSED_TPDO, number)
-            if not self.is_guarding_enabled:
-                continue
-            if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
-                guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, 0, now_ns)
-            elif not guard.is_quiet:
-                guard.clear(Condition.DRIVE_FAULT, number)
-            error = (targets[number] - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-            limit = axis.following_error_limit
-            if not -limit <= error <= limit:
-                guard.hold(Condition.FOLLOWING_ERROR, number, error, limit, now_ns)
-            elif not guard.is_quiet:
-                guard.clear(Condition.FOLLOWING_ERROR, number)
-        if guard.tripped:
+        master_position, _, _, targets, _, phase = self._in_force
+        self._watch.check(self._awaited, targets, master_position, phase, self.is_guarding_enabled, now_ns)
+        if self.guard.tripped:
             self.react()
 
-    def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:
-        cycles = self.guard.persistence(condition)
-        self.guard.hold(condition, number, cycles, cycles, now_ns)
+    def _begin_coupled_stop(self) -> None:
+        self._is_coupled_stop_due = False
+        if self._coupled_stop is not None:
+            self._coupled_stop.begin(self._in_force[0], self._in_force[1], self._sent[3])
+            self._demand = self._coupled_stop
 
     def react(self) -> None:
         """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
-        if self.guard.reaction is Reaction.QUICK_STOP:
+        reaction = self.guard.reaction
+        if reaction is Reaction.QUICK_STOP or reaction is Reaction.DISABLE:
             self.quick_stop()
-        elif self.guard.reaction is Reaction.CONTROLLED_STOP:
+        elif reaction is Reaction.CONTROLLED_STOP:
             self.controlled_stop()
 
     def _account(self, deadline_ns: int) -> None:
@@ -480,7 +471,7 @@ class CyclicLoop:
         lead_ns = deadline_ns - self._sent_ns
         if lead_ns < 0:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
-            self._hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
+            self.guard.hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
         elif not self.guard.is_quiet:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)
         arrival_ns = self._arrival_ns - self._sync_ns

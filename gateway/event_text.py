@@ -3,11 +3,20 @@
 import re
 from dataclasses import fields
 from enum import Enum
+from typing import Final
 
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
 from drivers.node import Event
 from gateway.core import StepReached
 from gateway.guard import Condition, GuardTripped
+
+_UNITS: Final = {
+    Condition.FOLLOWING_ERROR: "counts",
+    Condition.CAM_WINDOW: "counts",
+    Condition.FROZEN_ACTUAL: "counts of demand, the actual value stays",
+    Condition.VELOCITY: "counts a cycle",
+    Condition.TORQUE: "per mille of rated torque",
+}
 
 EventData = dict[str, str | int | float | bool | None]
 
@@ -37,17 +46,22 @@ def describe(event: Event) -> tuple[str, str, EventData]:
 
 
 def _guarded_value(condition: Condition, value: int, limit: int) -> str:
+    unit = _UNITS.get(condition)
+    if unit is not None:
+        return f"{value} {unit} (limit {limit})"
     match condition:
-        case Condition.FOLLOWING_ERROR:
-            return f"{value} counts (limit {limit})"
-        case Condition.MISSED_TPDO | Condition.MISSED_DEADLINE:
-            return f"{value} cycles in a row"
-        case Condition.EMERGENCY:
+        case Condition.END_EFFECTOR_ERROR:
+            return f"{value / 1000.0:.1f} mm (limit {limit / 1000.0:g})"
+        case Condition.EMERGENCY | Condition.EMERGENCY_WARNING:
             return f"{value:04X}h"
         case Condition.DRIVE_FAULT:
             return f"statusword {value:04X}h"
         case Condition.HEARTBEAT_LOST:
             return f"silent for {limit} ms, or restarted"
+        case Condition.OPERATOR_STOP | Condition.SIGINT | Condition.SIGTERM:
+            return "on request"
+        case _:
+            return f"{value} cycles in a row"
 
 
 def _describe_other(event: Event) -> tuple[str, str, EventData]:

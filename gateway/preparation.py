@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from config.conversion import desired_curve, five_bar, home_angles
+from config.conversion import closure_at_home, desired_curve, five_bar, home_angles
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
 from gateway.commissioning import NetworkSettings, NodeSettings
@@ -17,8 +17,10 @@ from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
 from gateway.powering import AxisSetup
+from gateway.reactions import CoupledStop
 from gateway.torque_offsets import build_torque_offsets, torque_violations
 from gateway.units import AxisUnits
+from gateway.watch import AxisLimits, CamWindow, CycleWatch
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import CamLimitError, MechanismError
@@ -159,9 +161,42 @@ def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[Gateway
     ]
 
 
+def guard_limits(config: GatewayConfig, profile: CamProfile) -> tuple[list[AxisLimits], CamWindow]:
+    """What the guard compares every cycle with, in the cycle's own units."""
+    guard = config.guard
+    axes = [
+        AxisLimits(
+            velocity_counts_per_cycle=guard.velocity.limit_percent
+            / 100.0
+            * axis.limits.velocity_rad_per_s
+            * axis.counts_per_revolution
+            / math.tau
+            * config.cycle_s,
+            torque_permille=guard.torque.limit_permille,
+            frozen_counts=round(guard.frozen_actual.limit_deg / 360.0 * axis.counts_per_revolution),
+        )
+        for axis in config.ordered_axes
+    ]
+    master, slave = config.ordered_axes
+    return axes, CamWindow(
+        geometry=five_bar(config).to_array(),
+        closure=int(closure_at_home(config, desired_curve(config))),
+        coefficients=profile.coefficients,
+        net_turns=profile.net_turns,
+        rad_per_count=(math.tau / master.counts_per_revolution, math.tau / slave.counts_per_revolution),
+        window_rad=math.radians(guard.cam_window.limit_deg),
+        end_effector_m=guard.end_effector_error.limit_mm / 1e3,
+    )
+
+
 def axis_units(axis: AxisSection) -> AxisUnits:
     """The converter of one axis."""
     return AxisUnits(axis.counts_per_revolution, math.radians(axis.home_angle_deg), axis.rated_torque_Nm)
+
+
+def _quick_stop_deceleration(axis: AxisSection) -> int | None:
+    deceleration = axis.limits.quick_stop_deceleration_rad_per_s2
+    return None if deceleration is None else round(deceleration * axis.counts_per_revolution / math.tau)
 
 
 def node_settings(config: GatewayConfig) -> list[NodeSettings]:
@@ -179,6 +214,8 @@ def node_settings(config: GatewayConfig) -> list[NodeSettings]:
             following_error_window=axis.limits.following_error_counts,
             rated_torque_mNm=round(axis.rated_torque_Nm * 1000.0),
             counts_per_revolution=axis.counts_per_revolution,
+            quick_stop_deceleration=_quick_stop_deceleration(axis),
+            torque_limit_permille=config.guard.torque.limit_permille,
         )
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
     ]
@@ -223,7 +260,17 @@ def build_core(
         for node, channel, axis in zip(node_settings(config), channels, config.ordered_axes, strict=True)
     ]
     guard = Guard(config.guard, config.axis_names)
-    loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock)
+    watch = CycleWatch(guard, channels, *guard_limits(config, profile))
+    deceleration = config.ordered_axes[0].limits.quick_stop_deceleration_rad_per_s2
+    coupled_stop = CoupledStop(
+        profile,
+        channels,
+        guard,
+        config.cycle_s,
+        config.ordered_axes[0].limits.acceleration_rad_per_s2 if deceleration is None else deceleration,
+    )
+    loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock, None, watch, coupled_stop)
+    loop.sync_gap_limit = config.guard.sync_lost.limit_cycles
     units = (channels[0].units, channels[1].units)
     demand = CamDemand(
         profile,

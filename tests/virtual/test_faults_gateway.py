@@ -67,15 +67,14 @@ def _ignore(_node: int, _event: Event) -> None:
         (Fault(FaultKind.OVER_CURRENT, SERVO, MOVING_S), StopReason.EMERGENCY),
         (Fault(FaultKind.OVER_VOLTAGE, CV, MOVING_S), StopReason.EMERGENCY),
         (Fault(FaultKind.SAFE_TORQUE_OFF, CV, MOVING_S), StopReason.EMERGENCY),
-        (Fault(FaultKind.ERROR_PASSIVE, SERVO, MOVING_S, 0.5), StopReason.EMERGENCY),
         (Fault(FaultKind.JUMPING_RESOLVER, SERVO, MOVING_S, counts=500), StopReason.FOLLOWING_ERROR),
         (Fault(FaultKind.MUTE_HEARTBEAT, SERVO, MOVING_S), StopReason.HEARTBEAT_LOST),
         (Fault(FaultKind.NODE_RESET, SERVO, MOVING_S), StopReason.HEARTBEAT_LOST),
-        (Fault(FaultKind.POWER_CYCLE, SERVO, MOVING_S, 1.0), StopReason.MISSED_TPDO),
-        (Fault(FaultKind.BUS_OFF, SERVO, MOVING_S, 0.5), StopReason.MISSED_TPDO),
+        (Fault(FaultKind.POWER_CYCLE, SERVO, MOVING_S, 1.0), StopReason.AXIS_SILENT),
+        (Fault(FaultKind.BUS_OFF, SERVO, MOVING_S, 0.5), StopReason.AXIS_SILENT),
         (
             Fault(FaultKind.LOST_FRAMES, SERVO, MOVING_S, cob_id=0x180 + SERVO, direction=Direction.SENT),
-            StopReason.MISSED_TPDO,
+            StopReason.AXIS_SILENT,
         ),
         (Fault(FaultKind.WRONG_IDENTITY, SERVO, product_code=7), StopReason.COMMISSIONING),
         (Fault(FaultKind.SDO_ABORT, SERVO, index=0x6060), StopReason.COMMISSIONING),
@@ -99,6 +98,7 @@ def test_a_fault_stops_the_machine_for_its_reason_and_in_one_piece(fault: Fault,
         Fault(FaultKind.REORDERED_FRAMES, SERVO, MOVING_S, probability=0.01),
         Fault(FaultKind.SLOW_SDO, SERVO, delay_s=0.1),
         Fault(FaultKind.BROKEN_BRAKE, SERVO, MOVING_S),
+        Fault(FaultKind.ERROR_PASSIVE, SERVO, MOVING_S, 0.5),
     ],
 )
 def test_what_is_bearable_is_borne(fault: Fault) -> None:
@@ -113,11 +113,12 @@ def test_a_wrong_identity_is_told_with_what_was_found() -> None:
     assert "node 2 has product code 00000007h" in str(run.core.failure)
 
 
-def test_a_frozen_resolver_is_noticed() -> None:
-    """Whether soon enough is the guard's limits' business, so that no more than the stop is asked for here."""
-    run = Run(Fault(FaultKind.FROZEN_RESOLVER, SERVO, MOVING_S))
-    assert run.reason is StopReason.FOLLOWING_ERROR
+@pytest.mark.parametrize("node", [CV, SERVO])
+def test_a_frozen_resolver_is_noticed_before_it_tears_the_linkage(node: int) -> None:
+    run = Run(Fault(FaultKind.FROZEN_RESOLVER, node, MOVING_S))
+    assert run.reason is StopReason.FROZEN_ACTUAL
     run.assert_ends_disabled()
+    assert run.machine.plant.torn_at_s is None
 
 
 def test_the_same_faults_and_seed_give_the_same_frames_at_the_same_nanoseconds() -> None:

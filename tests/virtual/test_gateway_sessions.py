@@ -276,7 +276,8 @@ def test_a_cam_that_starts_elsewhere_is_refused():
 
 
 def test_missed_tpdos_stop_the_machine_on_the_cam():
-    session = Session(cycles=5, faults=Dropping(SERVO_TPDO, 3 * SECOND, 50_000_000)).to_end()
+    patient = changed(("axis_silent: {persistence_cycles: 10", "axis_silent: {persistence_cycles: 1000"))
+    session = Session(patient, cycles=5, faults=Dropping(SERVO_TPDO, 3 * SECOND, 50_000_000)).to_end()
     assert session.core.stopped_by is StopReason.MISSED_TPDO
     assert [(trip.condition.value, trip.axis) for trip in session.trips] == [("missed_tpdo", "servo")]
     assert Phase.CONTROLLED_STOP in session.sink.samples["phase"]
@@ -453,7 +454,7 @@ def standstill_at_s():
 def test_what_calls_for_a_stop_before_the_motion_calls_for_none():
     from_ns = round((standstill_at_s() + 0.02) * SECOND)
     session = Session(faults=Dropping(SERVO_TPDO, from_ns, 30_000_000)).to_end()
-    assert session.core.stopped_by is StopReason.MISSED_TPDO
+    assert session.core.stopped_by is StopReason.AXIS_SILENT
     assert Phase.RAMP_UP not in session.sink.samples["phase"]
     session.assert_safe()
 

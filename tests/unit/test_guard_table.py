@@ -1,0 +1,187 @@
+"""The guard's table: what its limits may be, and what every cycle is compared with."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from config.guard_section import Reaction
+from config.loading import ConfigError, load_config, parse_config
+from gateway.axis_channel import AxisChannel
+from gateway.guard import REASON_OF, Condition, Guard, StopReason
+from gateway.preparation import guard_limits, prepare
+from gateway.sample import Phase
+from gateway.units import AxisUnits
+from gateway.watch import AxisLimits, CycleWatch
+from mechanism.cam_profile import CamProfile
+from mechanism.deviation import deviation
+
+PAPER = load_config("paper")
+UNITS = AxisUnits(4096, 0.0, 1.5)
+ENABLED, FAULT = 0x1237, 0x0218
+LIMITS = AxisLimits(velocity_counts_per_cycle=20.5, torque_permille=2500, frozen_counts=11)
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    old: str
+    new: str
+    sentence: str
+
+
+@pytest.mark.parametrize(
+    "refusal",
+    [
+        Refusal(
+            "limit_percent: 130",
+            "limit_percent: 100",
+            "would trip in motions that the axis' limits allow (bound: above",
+        ),
+        Refusal(
+            "limit_percent: 130", "limit_percent: 1001", "1001 can never trip, no axis turns at ten times its limit"
+        ),
+        Refusal(
+            "limit_permille: 2500", "limit_permille: 32767", "32767 can never trip, 6077h tells no more than 32767"
+        ),
+        Refusal("limit_deg: 20", "limit_deg: 180", "guard.cam_window.limit_deg: 180 can never trip"),
+        Refusal(
+            "limit_deg: 20", "limit_deg: 0.17", "guard.cam_window.limit_deg: 0.17 would always trip, it is less than 2"
+        ),
+        Refusal("limit_deg: 1.0", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
+        Refusal("limit_deg: 1.0", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
+        Refusal("limit_mm: 50", "limit_mm: 800", "can never trip, the linkage reaches 400 mm (bound: below 800)"),
+        Refusal("limit_mm: 50", "limit_mm: 1", "would always trip, the resolvers tell the end effector to 1.2 mm"),
+        Refusal(
+            "following_error_counts: 300", "following_error_counts: 2048", "2048 can never trip, half a revolution"
+        ),
+        Refusal("limit_cycles: 10", "limit_cycles: 200", "can never trip in time, after 200 ms the drives have missed"),
+        Refusal(
+            "sigterm: {reaction: controlled_stop}", "sigterm: {reaction: warn}", "warn would leave the machine running"
+        ),
+    ],
+)
+def test_a_limit_that_makes_no_sense_is_refused_in_one_sentence(refusal):
+    assert refusal.old in PAPER.text
+    with pytest.raises(ConfigError) as caught:
+        parse_config(PAPER.text.replace(refusal.old, refusal.new), PAPER.path)
+    assert refusal.sentence in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_every_condition_is_a_key_of_the_configuration_and_has_a_reason():
+    keys = set(type(PAPER.guard).model_fields)
+    assert {condition.value for condition in Condition} == keys
+    assert REASON_OF[Condition.SIGTERM] is StopReason.OPERATOR
+    assert REASON_OF[Condition.TORQUE] is StopReason.TORQUE
+
+
+def make(limits=LIMITS, **replaced):
+    section = PAPER.guard.model_copy(update=replaced)
+    guard = Guard(section, ("cv", "servo"))
+    axes = [AxisChannel("cv", 1, UNITS, 200), AxisChannel("servo", 2, UNITS, 300)]
+    for axis in axes:
+        axis.statusword = ENABLED
+    watch = CycleWatch(guard, axes, [limits, limits], guard_limits(PAPER, prepare(PAPER, 1).cam.profile)[1])
+    return guard, axes, watch
+
+
+def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
+    """``track``: (demand, actual) of the servo axis by cycle; returns the cycle of the first trip, None for none."""
+    for cycle, (demand, actual) in enumerate(track):
+        axes[1].actual = actual
+        watch.check(awaited, [0, demand], 0.0, phase, True, cycle)
+        if guard.tripped:
+            return cycle
+    return None
+
+
+def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_its_axis():
+    guard, axes, watch = make()
+    # From cycle 3 on the actual stays at 9; the demand goes 3 counts a cycle: 12 counts, more than 11, at cycle 7.
+    track = [(3 * n, min(3 * n, 9)) for n in range(20)]
+    assert run(watch, axes, guard, track) == 7
+    assert guard.tripped[0].condition is Condition.FROZEN_ACTUAL
+    assert guard.reaction is Reaction.DISABLE
+    assert guard.disabled == 0b10
+
+
+def test_an_axis_that_stands_as_it_should_is_not_frozen_nor_one_that_flickers():
+    guard, axes, watch = make()
+    assert run(watch, axes, guard, [(100, 100)] * 1000) is None
+    guard, axes, watch = make()
+    assert run(watch, axes, guard, [(n, n % 2) for n in range(250)]) is None
+
+
+def test_too_fast_is_judged_over_its_persistence_and_not_across_a_missed_tpdo():
+    guard, axes, watch = make()
+    # 21 counts a cycle are above 20.5; five in a row, the first of them in cycle 1.
+    assert run(watch, axes, guard, [(21 * n, 21 * n) for n in range(20)]) == 5
+    assert guard.tripped[0].value == 21
+    guard, axes, watch = make()
+    assert run(watch, axes, guard, [(20 * n, 20 * n) for n in range(100)]) is None
+    watch.check(0b10, [0, 0], 0.0, Phase.STANDSTILL, True, 0)
+    assert run(watch, axes, guard, [(5000 + 20 * n, 5000 + 20 * n) for n in range(100)]) is None
+
+
+def test_torque_and_fault_and_following_error_are_told_with_their_values():
+    guard, axes, watch = make()
+    axes[0].torque = -2501
+    for cycle in range(99):
+        watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, cycle)
+    assert guard.tripped == []
+    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 99)
+    trip = guard.tripped.pop()
+    assert (trip.condition, trip.axis, trip.value, trip.limit) == (Condition.TORQUE, "cv", -2501, 2500)
+    axes[1].statusword = FAULT
+    axes[1].actual = -301
+    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 100)
+    assert [(t.condition, t.axis, t.value) for t in guard.tripped] == [
+        (Condition.DRIVE_FAULT, "servo", FAULT),
+        (Condition.FOLLOWING_ERROR, "servo", 301),
+    ]
+
+
+def test_one_silent_axis_is_told_from_a_silent_bus():
+    guard, axes, watch = make()
+    for cycle in range(10):
+        watch.check(0b01, [0, 0], 0.0, Phase.CAM, True, cycle)
+    assert [trip.condition for trip in guard.tripped] == [Condition.AXIS_SILENT]
+    assert axes[0].silent_cycles == 10
+    guard, axes, watch = make()
+    for cycle in range(29):
+        watch.check(0b11, [0, 0], 0.0, Phase.CAM, True, cycle)
+    # The TPDOs are missed, of each axis; neither is silent alone.
+    assert [trip.condition for trip in guard.tripped] == [Condition.MISSED_TPDO] * 2
+    watch.check(0b11, [0, 0], 0.0, Phase.CAM, True, 30)
+    assert guard.tripped[-1].condition is Condition.BUS_OFF
+    assert guard.reaction is Reaction.QUICK_STOP
+
+
+def test_the_window_around_the_cam_and_the_end_effector():
+    guard, axes, watch = make()
+    # 20 deg are 227.6 counts: 228 trip it, and 50 mm are reached by no 19 deg of link s.
+    axes[1].actual = -227
+    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 0)
+    assert guard.tripped == []
+    axes[1].actual = -228
+    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 0)
+    assert guard.tripped == []
+    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 1)
+    assert [(trip.condition, trip.axis, trip.value, trip.limit) for trip in guard.tripped] == [
+        (Condition.CAM_WINDOW, "", 228, 228)
+    ]
+
+
+def test_deviation_by_hand():
+    """A square of p = s = 1, q = r, the pivots a diagonal apart: C stands symmetrically above the middle."""
+    geometry = np.array([1.0, 2.0, 2.0, 1.0, 0.0, 0.0, 2.0, 0.0])
+    # theta2 = theta5 = 90 deg: A (0, 1), D (2, 1), C = (1, 1 + sqrt 3). Turned by -90 deg each, C moves by (1, -1).
+    quarter = math.pi / 2
+    cam = CamProfile.through(np.arange(8) * math.tau / 8, np.full(8, quarter), knots=8)
+    window, miss = deviation(geometry, 1, cam.coefficients, 0, quarter, quarter, quarter)
+    assert window == pytest.approx(-quarter)
+    assert miss == pytest.approx(math.sqrt(2.0))
+    # No closure: far out of reach.
+    far = np.array([1.0, 0.1, 0.1, 1.0, 0.0, 0.0, 9.0, 0.0])
+    assert all(math.isnan(value) for value in deviation(far, 1, cam.coefficients, 0, 0.0, 0.0, 0.0))

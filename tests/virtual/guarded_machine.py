@@ -1,0 +1,163 @@
+"""A gateway and an emulated machine that fails on command, in virtual time, and what the linkage went through."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from config.conversion import closure_at_home, desired_curve, dynamics_parameters
+from config.loading import load_config, parse_config
+from config.schema import GatewayConfig
+from drivers.frame import Frame
+from drivers.node import Event
+from drivers.virtual_time import VirtualBus
+from gateway.guard import GuardTripped, StopReason
+from gateway.preparation import PreparedRun, build_core, prepare
+from gateway.sample import Phase
+from mechanism.dynamics import inverse_dynamics_along
+from sim_drive.assembly import build_machine
+from sim_drive.faults import Fault, FaultKind
+from sim_drive.injector import Injector
+
+SECOND = 1_000_000_000
+CV, SERVO = 1, 2
+PAPER = load_config("paper")
+CRUISE_FROM_S = 1.75
+"""The paper's machine is at its speed from here on; link p then stands at 320 deg."""
+
+
+def at_theta2(degrees: float) -> float:
+    """When (s) the CV axis of the paper's machine is at this angle in its first revolution at full speed."""
+    return CRUISE_FROM_S + ((degrees - 320.0) % 360.0) / 360.0
+
+
+def changed(*replacements: tuple[str, str]) -> GatewayConfig:
+    """The paper's configuration with parts of its text replaced."""
+    text = PAPER.text
+    for old, new in replacements:
+        assert old in text, old
+        text = text.replace(old, new)
+    return parse_config(text, PAPER.path)
+
+
+@lru_cache(maxsize=8)
+def prepared_run(text: str, cycles: int) -> PreparedRun:
+    return prepare(parse_config(text, PAPER.path), cycles)
+
+
+@dataclass(frozen=True, slots=True)
+class Strain:
+    """What the linkage went through from an instant on."""
+
+    least_sine: float
+    """Of the angle between q and r: the distance to the singular position, 0 in it."""
+    cam_distance_rad: float
+    """Greatest distance of link s from the cam of link p's actual angle."""
+    shaft_torques_Nm: tuple[float, float]
+    """Peak of what motor, brake and friction together put on each shaft."""
+    rest_s: float
+    """From the instant to the last motion of either axis."""
+
+
+class Guarded:
+    """A session and its machine; the machine's true angles are kept for every servo tick."""
+
+    def __init__(
+        self,
+        *faults: Fault,
+        config: GatewayConfig = PAPER,
+        cycles: int = 1,
+        seed: int = 0,
+        is_brakeless: bool = False,
+        bus_faults: object = None,
+        trace: Callable[[int, Frame], None] | None = None,
+    ) -> None:
+        self.config = config
+        self.prepared = prepared_run(config.text, cycles)
+        self.machine = build_machine(config, record_ticks=200_000)
+        brakes = (Fault(FaultKind.BROKEN_BRAKE, node, 1.0) for node in (CV, SERVO) if is_brakeless)
+        self.injector = Injector(self.machine, (*faults, *brakes), seed)
+        self.samples: list[tuple[float, ...]] = []
+        self.core = build_core(config, self.prepared.cam.profile, self.prepared.plan, self)
+        self.events: list[Event] = []
+        self.bus = VirtualBus(
+            [self.core, self.injector],
+            config.bus.bit_rate,
+            seed,
+            trace,
+            bus_faults,
+            on_event=lambda node, event: self.events.append(event),
+        )
+
+    def append(self, *values: float) -> None:
+        self.samples.append(values)
+
+    def until(self, at_s: float) -> "Guarded":
+        self.bus.run_until(round(at_s * SECOND))
+        return self
+
+    def inject(self, fault: Fault) -> "Guarded":
+        self.injector.inject(fault, self.bus.now_ns)
+        self.bus.refresh()
+        return self
+
+    def to_end(self, limit_s: float = 30.0, after_s: float = 0.3) -> "Guarded":
+        self.bus.run_while(lambda: not self.core.is_done, round(limit_s * SECOND))
+        self.bus.run_until(self.bus.now_ns + round(after_s * SECOND))
+        return self
+
+    @property
+    def stopped_by(self) -> StopReason:
+        return self.core.stopped_by
+
+    @property
+    def trips(self) -> list[GuardTripped]:
+        return [event for event in self.events if isinstance(event, GuardTripped)]
+
+    @property
+    def is_torn(self) -> bool:
+        return self.machine.plant.torn_at_s is not None
+
+    @property
+    def phases(self) -> set[Phase]:
+        return {Phase(int(sample[12])) for sample in self.samples}
+
+    @property
+    def is_without_torque(self) -> bool:
+        return not any(drive.is_powered for drive in self.machine.drives)
+
+    def strain(self, from_s: float, to_s: float = math.inf) -> Strain:
+        """What the linkage went through between two instants."""
+        records = [r for r in self.machine.records if from_s * SECOND <= r.at_ns <= to_s * SECOND]
+        angles = np.array([record.angles_rad for record in records])
+        tick_s = 1.0 / 1024.0
+        five_bar = self.machine.plant.parameters.dynamics.five_bar
+        closure = self.machine.plant.parameters.closure
+        sines = np.abs(five_bar.transmission_sines(angles[:, 0], angles[:, 1], closure)[:, 0])
+        cam = self.prepared.cam.profile.at_many(angles[:, 0])[:, 0]
+        moved = np.abs(np.diff(angles, axis=0)).max(axis=1) > 2e-6
+        rest = float((np.flatnonzero(moved)[-1] + 1) * tick_s) if moved.any() else 0.0
+        return Strain(
+            float("nan") if not np.isfinite(sines).all() else float(sines.min()),
+            float(np.abs(angles[:, 1] - cam).max()),
+            shaft_torques(angles, tick_s, self.config),
+            rest,
+        )
+
+
+def shaft_torques(angles: np.ndarray, tick_s: float, config: GatewayConfig) -> tuple[float, float]:
+    """Peaks of the torques at both shafts, by inverse dynamics of the motion (angles at servo ticks)."""
+    omega = np.gradient(angles, tick_s, axis=0)
+    alpha = np.gradient(omega, tick_s, axis=0)
+    torques = np.empty_like(angles)
+    closure = closure_at_home(config, desired_curve(config))
+    params = dynamics_parameters(config).to_array()
+    inverse_dynamics_along(params, angles, omega, alpha, int(closure), 0.0, torques)
+    peaks = np.abs(torques).max(axis=0)
+    return float(peaks[0]), float(peaks[1])
+
+
+def first_of(events: Sequence[Event], kind: type[Event]) -> Event | None:
+    return next((event for event in events if isinstance(event, kind)), None)

@@ -1,0 +1,101 @@
+"""An axis is lost in motion: what the other one does keeps the linkage away from its singular positions."""
+
+import math
+
+import pytest
+from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2, changed
+
+from gateway.guard import StopReason
+from gateway.sample import Phase
+from sim_drive.faults import Fault, FaultKind
+
+BOUND_RAD = math.radians(20.0)
+"""How far from the cam the servo axis may get if the lost axis has a brake."""
+BOUND_SINE = 0.75
+"""The cam's own least sine is 0.80."""
+BOUND_REST_S = 0.1
+IDLE = changed(
+    *(
+        (f"{key}: {{reaction: quick_stop}}", f"{key}: {{reaction: warn}}")
+        for key in ("emergency", "drive_fault", "heartbeat_lost")
+    ),
+    ("persistence_cycles: 1, reaction: quick_stop", "reaction: warn"),
+    ("limit_deg: 20, reaction: quick_stop", "limit_deg: 20, reaction: warn"),
+    ("limit_percent: 130, persistence_cycles: 5, reaction: quick_stop", "limit_percent: 130, reaction: warn"),
+    ("limit_mm: 50, persistence_cycles: 5, reaction: quick_stop", "limit_mm: 50, reaction: warn"),
+    ("persistence_cycles: 10, reaction: quick_stop", "reaction: warn"),
+    (
+        "limit_permille: 2500, persistence_cycles: 100, reaction: controlled_stop",
+        "limit_permille: 2500, reaction: warn",
+    ),
+    ("limit_deg: 1.0, reaction: disable", "limit_deg: 1.0, reaction: warn"),
+    ("persistence_cycles: 20, reaction: controlled_stop", "reaction: warn"),
+)
+"""A gateway that looks on."""
+LOSSES = [
+    FaultKind.OVER_CURRENT,
+    FaultKind.OVER_VOLTAGE,
+    FaultKind.FROZEN_RESOLVER,
+    FaultKind.POWER_CYCLE,
+    FaultKind.BUS_OFF,
+]
+
+
+def lose(kind, node, at_s, config=PAPER):
+    return Guarded(Fault(kind, node, at_s), config=config, cycles=2).to_end(limit_s=at_s + 5.0)
+
+
+def assert_linkage_kept(run, at_s):
+    strain = run.strain(at_s, at_s + 1.0)
+    assert not run.is_torn
+    assert strain.least_sine > BOUND_SINE
+    assert strain.cam_distance_rad < BOUND_RAD
+    assert strain.rest_s < BOUND_REST_S
+    assert run.is_without_torque
+    assert run.stopped_by is not StopReason.COMPLETED
+
+
+@pytest.mark.parametrize(
+    ("kind", "node", "theta2"),
+    [
+        (FaultKind.OVER_CURRENT, CV, 330),
+        (FaultKind.OVER_CURRENT, SERVO, 5),
+        (FaultKind.FROZEN_RESOLVER, CV, 320),
+        (FaultKind.POWER_CYCLE, SERVO, 325),
+    ],
+)
+def test_whichever_axis_is_lost_the_other_keeps_the_linkage_together(kind, node, theta2):
+    """In the return stroke, where the cam is steepest, and where a gateway that looks on tears the linkage."""
+    at_s = at_theta2(theta2)
+    assert_linkage_kept(lose(kind, node, at_s), at_s)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("node", [CV, SERVO])
+@pytest.mark.parametrize("kind", LOSSES)
+@pytest.mark.parametrize("theta2", [5, 100, 186, 310, 335])
+def test_the_linkage_is_kept_together_whatever_is_lost_wherever(kind, node, theta2):
+    at_s = at_theta2(theta2)
+    assert_linkage_kept(lose(kind, node, at_s), at_s)
+
+
+def test_a_gateway_that_looks_on_tears_the_linkage():
+    """The yardstick: the servo axis is lost where the cam begins, and the CV axis goes on half a revolution."""
+    at_s = at_theta2(5)
+    run = lose(FaultKind.OVER_CURRENT, SERVO, at_s, IDLE)
+    assert run.is_torn
+    assert run.strain(at_s).least_sine < 0.1
+
+
+def test_the_slave_follows_a_master_that_runs_out_without_torque_and_brake():
+    """The slave, which has torque, stays on the cam of a master that swings freely until that comes to rest."""
+    at_s = at_theta2(32)
+    run = Guarded(Fault(FaultKind.BROKEN_BRAKE, CV, 1.0), Fault(FaultKind.OVER_CURRENT, CV, at_s), cycles=2).to_end()
+    strain = run.strain(at_s)
+    assert not run.is_torn
+    assert strain.least_sine > BOUND_SINE
+    assert strain.cam_distance_rad < BOUND_RAD
+    assert Phase.QUICK_STOP in run.phases
+    assert run.is_without_torque
+    # Far from a dead stop: it swung for more than a second.
+    assert strain.rest_s > 1.0
