@@ -125,7 +125,7 @@ class GuardSection(Model):
     frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, reaction=_DISABLE)
     """The demand has gone so far while the actual value has not changed by a single count."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
-    axis_silent: ConditionSection = ConditionSection(persistence_cycles=10, reaction=_QUICK)
+    axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)
     """An axis' TPDO is missing while another axis' have come: it is that drive, not the bus or the host."""
     missed_deadline: ConditionSection = ConditionSection(persistence_cycles=20, reaction=_CONTROLLED)
     emergency: ConditionSection = ConditionSection(reaction=_QUICK)

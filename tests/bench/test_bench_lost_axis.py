@@ -8,10 +8,10 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "virtual"))
 
-from guarded_machine import CV, PAPER, SERVO, at_theta2  # noqa: E402
-from test_guard_lost_axis import IDLE, lose  # noqa: E402
+from guarded_machine import CV, PAPER, SERVO, at_theta2
+from test_guard_lost_axis import IDLE, lose
 
-from sim_drive.faults import FaultKind  # noqa: E402
+from sim_drive.faults import FaultKind
 
 
 @pytest.mark.bench

@@ -23,7 +23,7 @@ IDLE = changed(
     ("limit_deg: 20, reaction: quick_stop", "limit_deg: 20, reaction: warn"),
     ("limit_percent: 130, persistence_cycles: 5, reaction: quick_stop", "limit_percent: 130, reaction: warn"),
     ("limit_mm: 50, persistence_cycles: 5, reaction: quick_stop", "limit_mm: 50, reaction: warn"),
-    ("persistence_cycles: 10, reaction: quick_stop", "reaction: warn"),
+    ("persistence_cycles: 5, reaction: quick_stop}\n  missed_dead", "reaction: warn}\n  missed_dead"),
     (
         "limit_permille: 2500, persistence_cycles: 100, reaction: controlled_stop",
         "limit_permille: 2500, reaction: warn",
