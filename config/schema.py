@@ -310,7 +310,7 @@ class FeedForwardSection(Model):
     links: NominalLinksSection = NominalLinksSection()
     end_effector_mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
     gravity_m_s2: Point | None = None
-    axes: dict[AxisName, NominalAxisSection] = {}
+    axes: dict[AxisName, NominalAxisSection] = Field(default_factory=dict[AxisName, NominalAxisSection])
 
 
 class EmulatorSection(Model):
