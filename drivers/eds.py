@@ -51,15 +51,29 @@ def load_eds(path: Path | str, node_id: int) -> ObjectDictionary:
     return describe_any_node(path)(node_id)
 
 
-def describe_any_node(path: Path | str) -> Callable[[int], ObjectDictionary]:
+def describe_any_node(
+    path: Path | str, change: Callable[[str], str] | None = None
+) -> Callable[[int], ObjectDictionary]:
     """Read the EDS file at ``path`` once, to make of it the object dictionary of any node id, as ``load_eds`` does.
 
-    What it gives raises as ``load_eds`` does. Raises EdsError if the file cannot be read.
+    ``change`` makes the text of another EDS of the file's. What is given raises as ``load_eds`` does. Raises EdsError
+    if the file cannot be read or changed.
     """
+    text = read_eds_text(path)
+    if change is not None:
+        try:
+            text = change(text)
+        except _PARSE_ERRORS as error:
+            raise EdsError(f"{path}: not a readable EDS file: {' '.join(str(error).split())}") from None
+    return lambda node_id: _describe(path, text, node_id)
+
+
+def read_eds_text(path: Path | str) -> str:
+    """The text of an EDS file. Raises EdsError: it is missing, too large or no EDS; one sentence with its name."""
     text = _read(Path(path))
     if "[DeviceInfo]" not in text:
         raise EdsError(f"{path}: not an EDS file: it has no section DeviceInfo")
-    return lambda node_id: _describe(path, text, node_id)
+    return text
 
 
 def _describe(path: Path | str, text: str, node_id: int) -> ObjectDictionary:

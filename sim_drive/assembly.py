@@ -4,10 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from math import inf, radians
+from pathlib import Path
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
 from config.loading import SHIPPED
+from config.quirks import Quirk
 from config.schema import AxisSection, FrictionLaw, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
@@ -15,6 +17,7 @@ from mechanism.cam_image import decode_cam_image
 from sim_drive.drive import Drive
 from sim_drive.driveline import MotorParameters
 from sim_drive.energy_meter import attach_energy_meter
+from sim_drive.logical_axes import MAX_AXES, eds_of_axes
 from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.node_row import describe_row
 from sim_drive.parameter_file import make_parameter_store
@@ -34,15 +37,24 @@ SINGULAR_SHARE: Final = 0.5
 """The plant tears at this share of the transmission sine that the configuration keeps as its distance."""
 
 
-def build_machine(config: GatewayConfig, seed: int = 0, start_ns: int = 0, record_ticks: int = 0) -> EmulatedMachine:
+def build_machine(
+    config: GatewayConfig, seed: int = 0, start_ns: int = 0, record_ticks: int = 0, *, in_one_node: bool = False
+) -> EmulatedMachine:
     """The configuration's drives and coupled plant, standing at the home position with the brakes engaged.
 
     ``start_ns``: the host's time at which it is put on the bus; ``seed`` decides the resolvers' noise;
-    ``record_ticks``: see EmulatedMachine. Raises drivers.errors.EdsError or mechanism.errors.MechanismError.
+    ``record_ticks``: see EmulatedMachine. ``in_one_node``: both axes are logical axes of one drive, which has the node
+    id, the identity and all habits of the first. Raises drivers.errors.EdsError or mechanism.errors.MechanismError.
     """
     axes = config.ordered_axes
-    describe = describe_any_node(config.relative(config.emulator.eds))
-    drives = [_make_drive(axis.node_id, drive_settings(axis, config), describe) for axis in axes]
+    settings = [drive_settings(axis, config) for axis in axes]
+    if in_one_node:
+        quirks = frozenset[Quirk]().union(*(own.quirks for own in settings))
+        first, *further = (replace(own, quirks=quirks) for own in settings)
+        settings = [replace(first, further_axes=tuple(further))]
+    describe = _describe(config.relative(config.emulator.eds), settings[0])
+    node_ids = [axis.node_id for axis in axes]
+    drives = [_make_drive(node_id, own, describe) for node_id, own in zip(node_ids, settings, strict=False)]
     parameters = PlantParameters(
         dynamics=dynamics_parameters(config),
         closure=closure_at_home(config, desired_curve(config)),
@@ -64,7 +76,7 @@ def free_machine(
     seed: int = 0,
     record_ticks: int = 0,
 ) -> EmulatedMachine:
-    """Drives without a configuration, each on an axis of its own that is coupled to nothing, at 0 rad, brake engaged.
+    """Drives without a configuration, each axis moving a shaft that is coupled to nothing, at 0 rad, brake engaged.
 
     ``settings``: of every drive, save that each has its node id for a serial number, and in the name of a parameter
     file; by default those of the EDS file that ships, with gains that suit the axis. ``start_ns``, ``seed``,
@@ -78,14 +90,30 @@ def free_machine(
         if node_ids.count(node_id) > 1:
             raise ValueError(f"node id {node_id} is given twice, every node id must be unique")
     common = DriveSettings(gains=FREE_AXIS_GAINS) if settings is None else settings
-    describe = describe_any_node(SHIPPED_EDS)
+    describe = _describe(SHIPPED_EDS, common)
     if len(node_ids) > _FEW_NODES:
         describe = describe_row(describe)
     drives = [_make_drive(node_id, _settings_in_row(common, node_id), describe) for node_id in node_ids]
-    axis = MachineAxis(common.counts_per_revolution, rated_torque_Nm=common.rated_torque_Nm)
-    plant = FreeAxisPlant([FREE_AXIS] * len(drives), [0.0] * len(drives))
+    axes = [
+        MachineAxis(own.counts_per_revolution, rated_torque_Nm=own.rated_torque_Nm)
+        for _ in drives
+        for own in (common, *common.further_axes)
+    ]
+    plant = FreeAxisPlant([FREE_AXIS] * len(axes), [0.0] * len(axes))
     _attach_meters(drives, plant)
-    return EmulatedMachine(drives, plant, [axis] * len(drives), start_ns, seed, record_ticks)
+    return EmulatedMachine(drives, plant, axes, start_ns, seed, record_ticks)
+
+
+def settings_of_axes(settings: DriveSettings, axes: int) -> DriveSettings:
+    """A drive of so many logical axes, all of them with ``settings``. Raises ValueError: not 1 to 8."""
+    if not 1 <= axes <= MAX_AXES:
+        raise ValueError(f"a node has 1 to {MAX_AXES} axes, not {axes}")
+    return replace(settings, further_axes=(settings,) * (axes - 1))
+
+
+def _describe(eds: Path, settings: DriveSettings) -> Callable[[int], ObjectDictionary]:
+    axes = len(settings.further_axes) + 1
+    return describe_any_node(eds, lambda text: eds_of_axes(text, axes))
 
 
 def _settings_in_row(common: DriveSettings, node_id: int) -> DriveSettings:
@@ -117,8 +145,8 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
 
 
 def _attach_meters(drives: Sequence[Drive], plant: Plant) -> None:
-    for axis, drive in enumerate(drives):
-        attach_energy_meter(drive.dictionary, partial(plant.axis_energy, axis))
+    for place, axis in enumerate(axis for drive in drives for axis in drive.axes):
+        attach_energy_meter(axis, partial(plant.axis_energy, place))
 
 
 def _make_drive(node_id: int, settings: DriveSettings, describe: Callable[[int], ObjectDictionary]) -> Drive:

@@ -30,7 +30,7 @@ from sim_drive.cia402 import (
     next_state,
 )
 from sim_drive.dictionary import Entry, LiveDictionary
-from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
+from sim_drive.emcy import AxisErrors, EmergencyCode, ErrorRegister
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.camming import Camming
 from sim_drive.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
@@ -90,8 +90,8 @@ class Axis(Motion):
         "_after_ramp",
         "_coming_mode",
         "_digital_inputs",
-        "_emergency",
         "_enabled_bits",
+        "_errors",
         "_events",
         "_following_error",
         "_following_error_since_ns",
@@ -121,6 +121,7 @@ class Axis(Motion):
         "_velocity_actual",
         "gains",
         "is_powered",
+        "is_switched_off",
         "negative_torque_limit_Nm",
         "node_id",
         "on_sync",
@@ -134,14 +135,14 @@ class Axis(Motion):
         dictionary: LiveDictionary,
         settings: DriveSettings,
         slots: CamSlots,
-        emergency: EmergencyProducer,
+        errors: AxisErrors,
         events: list[Event],
-        base: int = 0,
+        number: int = 1,
     ) -> None:
-        super().__init__(dictionary, settings, base)
+        super().__init__(dictionary, settings, number)
         self.node_id = node_id
         """For its events alone; the drive changes it when it gets another one."""
-        self._emergency = emergency
+        self._errors = errors
         self._events = events
 
         entry = self.entry
@@ -205,6 +206,8 @@ class Axis(Motion):
         self._mode = Mode.NONE
         self.is_powered = False
         """Whether the amplifier may put torque on the motor."""
+        self.is_switched_off = False
+        """Without supply, as the drive has it."""
         self._after_ramp: PowerState | None = None
         """The state that is next when the axis has come to rest."""
         self._following_error_since_ns: int | None = None
@@ -222,10 +225,6 @@ class Axis(Motion):
     def _set_defaults(self) -> None:
         settings = self.settings
         defaults = {
-            (objects.IDENTITY, 1): settings.identity.vendor_id,
-            (objects.IDENTITY, 2): settings.identity.product_code,
-            (objects.IDENTITY, 3): settings.identity.revision_number,
-            (objects.IDENTITY, 4): settings.identity.serial_number,
             (objects.POSITION_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
             (objects.MOTOR_RATED_TORQUE, 0): round(settings.rated_torque_Nm * 1000.0),
         }
@@ -315,6 +314,11 @@ class Axis(Motion):
         return self.offset
 
     @property
+    def is_brake_released(self) -> bool:
+        """Whether the holding brake is open: exactly while there is torque to hold the axis."""
+        return self.is_powered
+
+    @property
     def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
         """Torque offset 60B2h, to be added to the controller's torque; 0 unless operation is enabled."""
         if self._state is not _OPERATION_ENABLED:
@@ -378,13 +382,15 @@ class Axis(Motion):
             self._guard_following_error(demand - shaft_counts, now_ns)
 
     def _tick_without_power(self, now_ns: int) -> None:
+        if self.is_switched_off:
+            return
         state = self._state
         shaft_counts = self.shaft_counts
         self.position_demand_counts = float(shaft_counts)
         self.demand.hold(float(shaft_counts))
         if state is PowerState.NOT_READY_TO_SWITCH_ON:
             # A fault whose cause has outlived a reset is a fault again.
-            is_healthy = not self._emergency.has_persisting_fault
+            is_healthy = not self._errors.has_persisting_fault
             ready = PowerState.SWITCH_ON_DISABLED if is_healthy else PowerState.FAULT_REACTION_ACTIVE
             self._go_to_state(ready, now_ns)
         elif state is PowerState.FAULT_REACTION_ACTIVE:
@@ -465,8 +471,8 @@ class Axis(Motion):
         self._idle_controlword = _NO_CONTROLWORD
         before: int = self.controlword.value
         if value & ~before & _FAULT_RESET and self._state is PowerState.FAULT:
-            if not self._emergency.has_persisting_fault:
-                self._emergency.reset_fault(now_ns)
+            if not self._errors.has_persisting_fault:
+                self._errors.reset_fault(now_ns)
                 self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
             return None
         command = COMMANDS[value & 0xFF]
@@ -541,7 +547,7 @@ class Axis(Motion):
         if action == AbortConnection.FAULT:
             self.trip(error_code, register_bits, now_ns, persists=persists)
             return
-        self._emergency.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=persists)
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=persists)
         if action == AbortConnection.DISABLE_VOLTAGE:
             self._execute(PowerCommand.DISABLE_VOLTAGE, now_ns)
         elif action == AbortConnection.QUICK_STOP:
@@ -555,7 +561,7 @@ class Axis(Motion):
         self._state = state
         self._after_ramp = None
         self._idle_controlword = _NO_CONTROLWORD
-        self._events.append(PowerStateChanged(now_ns, self.node_id, before, state))
+        self._events.append(PowerStateChanged(now_ns, self.node_id, before, state, self.number))
         was_powered = self.is_powered
         self.is_powered = state is PowerState.OPERATION_ENABLED or (
             was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}
@@ -573,9 +579,14 @@ class Axis(Motion):
     def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
         """Raise an error that leads to a fault: EMCY at once, then the fault reaction 605Eh, then the state fault.
 
-        ``persists``: no fault reset is accepted until ``EmergencyProducer.end_cause`` is called.
+        ``persists``: no fault reset is accepted until ``end_warning`` is called. An axis without supply notices nothing
+        but a cause that persists, once it has one again.
         """
-        self._emergency.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=persists)
+        if self.is_switched_off:
+            if persists:
+                self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=True)
+            return
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=persists)
         if self._state in {PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT}:
             return
         if self.is_powered:
@@ -588,11 +599,11 @@ class Axis(Motion):
 
     def warn(self, error_code: int, register_bits: int, now_ns: int) -> None:
         """Raise an error that leads to no fault: EMCY alone."""
-        self._emergency.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=False)
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=False)
 
     def end_warning(self, error_code: int, now_ns: int) -> None:
-        """The cause of an error that has led to no fault is gone."""
-        self._emergency.end_cause(error_code, now_ns)
+        """The cause of an error is gone; a fault that it has led to is still to be reset."""
+        self._errors.end_cause(error_code, now_ns)
 
     # -- modes ---------------------------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from drivers.objects import (
 from drivers.sdo import AbortCode
 from mechanism.errors import CamFileError
 from sim_drive.dictionary import LiveDictionary
+from sim_drive.logical_axes import of_axis
 
 SLOT_CAPACITY: Final = 64 * 1024
 """Bytes that one slot takes."""
@@ -65,8 +66,8 @@ class SlotCommand(IntEnum):
 class _Slot:
     __slots__ = ("command", "crc", "data", "error", "image", "number", "points", "reason", "state", "status", "table")
 
-    def __init__(self, number: int, dictionary: LiveDictionary) -> None:
-        index = PROFILE_SLOT + number - 1
+    def __init__(self, number: int, dictionary: LiveDictionary, axis: int) -> None:
+        index = of_axis(PROFILE_SLOT + number - 1, axis)
         self.number = number
         self.data = dictionary.entry(index, PROFILE_SLOT_DATA)
         self.command = dictionary.entry(index, PROFILE_SLOT_COMMAND)
@@ -96,17 +97,18 @@ class _Slot:
 
 
 class CamSlots:
-    """The four slots. They stand for non-volatile memory: an NMT reset leaves them as they are."""
+    """The four slots of an axis. They stand for non-volatile memory: an NMT reset leaves them as they are."""
 
     __slots__ = ("_decode", "_slots", "is_running", "selected_number")
 
-    def __init__(self, dictionary: LiveDictionary, decode: CamDecoder) -> None:
+    def __init__(self, dictionary: LiveDictionary, decode: CamDecoder, axis: int = 1) -> None:
+        """``axis``: the logical axis whose slots they are."""
         self._decode = decode
-        self._slots = [_Slot(number, dictionary) for number in range(1, PROFILE_SLOT_COUNT + 1)]
+        self._slots = [_Slot(number, dictionary, axis) for number in range(1, PROFILE_SLOT_COUNT + 1)]
         self.selected_number = 0
         self.is_running = False
         """The drive is camming: the selected slot may be neither changed nor left."""
-        dictionary.entry(PROFILE_SLOT_SELECTED).on_write = self._on_selected
+        dictionary.entry(of_axis(PROFILE_SLOT_SELECTED, axis)).on_write = self._on_selected
         for slot in self._slots:
             slot.data.capacity = SLOT_CAPACITY
             slot.data.on_domain = self._data_writer(slot)

@@ -130,6 +130,8 @@ class PowerStateChanged(Event):
     node_id: int
     before: PowerState
     after: PowerState
+    axis: int = 1
+    """Number of the logical axis."""
 
 
 @unique

@@ -1,4 +1,4 @@
-"""One emulated CANopen node: NMT, SDO, PDO, SYNC, heartbeats and EMCY around a CiA 402 axis; a core without I/O."""
+"""One emulated CANopen node: NMT, SDO, PDO, SYNC, heartbeats and EMCY around CiA 402 axes; a core without I/O."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,12 +11,13 @@ from drivers.nmt import HEARTBEAT_BASE, MAX_NODE_ID, NMT_COB_ID, NmtCommand, Nmt
 from drivers.node import Event
 from drivers.object_dictionary import ObjectDictionary
 from drivers.sdo import SDO_REQUEST_BASE, ClientCommand
-from sim_drive.axis import Axis, Latch
+from sim_drive.axis import Axis
 from sim_drive.cam_slots import CamDecoder, CamSlots
 from sim_drive.cia402 import Mode, PowerState
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.heartbeat import HeartbeatConsumer, HeartbeatProducer
+from sim_drive.logical_axes import MAX_AXES, of_axis
 from sim_drive.lss_slave import LSS_REQUEST_COB_ID, UNCONFIGURED_NODE_ID, LssHooks, LssSlave
 from sim_drive.nmt_slave import next_state, parse_command
 from sim_drive.node_guarding import NodeGuard
@@ -102,16 +103,21 @@ class Drive:
     ) -> None:
         """Make a drive that is switched off; ``dictionary`` is what ``load_eds`` gives for this node id.
 
+        With ``settings.further_axes`` it has several logical axes (``logical_axes.eds_of_axes`` makes the EDS of it).
+
         ``store`` is its non-volatile memory (see ``parameter_file.make_parameter_store``); None: one of its own, which
         is lost with the drive. ``describe`` gives the dictionary for any node id (``drivers.eds.describe_any_node``);
         without it LSS cannot give the drive another one. What is stored for LSS goes before ``node_id``.
 
         Raises:
-            ValueError: ``node_id`` is neither 1 to 127 nor, with ``describe``, 255, or ``settings.gains`` are not five.
+            ValueError: ``node_id`` is neither 1 to 127 nor, with ``describe``, 255, or ``gains`` are not five, or there
+                are more than eight axes.
             KeyError: the dictionary lacks an object that the drive needs.
         """
         if not 1 <= node_id <= MAX_NODE_ID and (node_id != UNCONFIGURED_NODE_ID or describe is None):
             raise ValueError(f"node_id must be 1 to {MAX_NODE_ID}, not {node_id}")
+        if len(settings.further_axes) >= MAX_AXES:
+            raise ValueError(f"a node has at most {MAX_AXES} axes, not {len(settings.further_axes) + 1}")
         self.node_id = node_id
         """It changes at a reset, if LSS has given another one."""
         self._made_node_id: Final = node_id
@@ -123,10 +129,20 @@ class Drive:
         self.subscriptions_changed = True
         """Set whenever ``cob_ids`` gives something else than before; whoever re-reads it sets it back."""
 
-        self._emergency = EmergencyProducer(node_id, self.dictionary, self.outbox, self.events)
-        self.cam_slots: Final = CamSlots(self.dictionary, decode_cam)
-        self.axis: Final = Axis(node_id, self.dictionary, settings, self.cam_slots, self._emergency, self.events)
-        self.axis.latch = self._last_tick
+        numbers = range(1, len(settings.further_axes) + 2)
+        codes = [self.dictionary.entry(of_axis(objects.ERROR_CODE, number)) for number in numbers]
+        self._emergency = EmergencyProducer(node_id, self.dictionary, self.outbox, self.events, codes)
+        self._cam_slots = [CamSlots(self.dictionary, decode_cam, number) for number in numbers]
+        self.axes: Final = tuple(
+            Axis(
+                node_id, self.dictionary, own, self._cam_slots[number - 1], self._emergency.of_axis(number),
+                self.events, number,
+            )
+            for number, own in zip(numbers, (settings, *settings.further_axes), strict=True)
+        )  # fmt: skip
+        """The logical axes, one in most nodes."""
+        self.axis: Final = self.axes[0]
+        self._set_identity()
         sdo_timeout_ns = round(settings.sdo_timeout_s * _NS_PER_S)
         self._sdo = SdoServer(node_id, self.dictionary, self.outbox, sdo_timeout_ns, settings.sdo_block_size)
         self._producer = HeartbeatProducer(node_id, self.dictionary, self.outbox)
@@ -136,7 +152,7 @@ class Drive:
         self._emergency.on_held_back = self._expect_wake
         self._pdos = PdoExchange(
             self.dictionary,
-            self.axis,
+            self.axes,
             self.outbox,
             self._emergency,
             self._subscribe,
@@ -149,7 +165,8 @@ class Drive:
         self._lss = LssSlave(node_id, self.dictionary, self.outbox, hooks, can_change=describe is not None)
         if self._memory.stored.values:
             self._memory.apply(objects.DEVICE_TYPE, _LAST_INDEX)
-            self.axis.restore()
+            for axis in self.axes:
+                axis.restore()
 
         self._handlers: dict[int, FrameHandler] = {}
         self._request_handlers: dict[int, RequestHandler] = {}
@@ -162,6 +179,14 @@ class Drive:
         self._next_wake_ns: int | None = 0
         self._is_wake_stale = False
         apply_quirks(self)
+
+    def _set_identity(self) -> None:
+        identity = self.settings.identity
+        parts = (identity.vendor_id, identity.product_code, identity.revision_number, identity.serial_number)
+        for subindex, part in enumerate(parts, start=1):
+            entry = self.dictionary.entry(objects.IDENTITY, subindex)
+            entry.default = part
+            entry.value = part
 
     # -- the seam ------------------------------------------------------------------------------------------------
 
@@ -239,99 +264,67 @@ class Drive:
 
     # -- what the machine uses -----------------------------------------------------------------------------------
 
-    @property
-    def latch(self) -> Latch:
-        """Where actual values come from; the machine puts the plant's here."""
-        return self.axis.latch
-
-    @latch.setter
-    def latch(self, latch: Latch) -> None:
-        self.axis.latch = latch
-
-    def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None:
-        """One servo period, with the resolver's counts since power-on."""
-        if self.is_switched_off:
-            self.axis.shaft_counts = shaft_counts
-            return
-        self.axis.on_tick(now_ns, shaft_counts)
+    def after_servo_tick(self, now_ns: int) -> None:
+        """Every axis has had its servo tick: see what event-driven TPDOs make of it."""
         if self._pdos.event_tpdos and self._pdos.is_operational:
             self._pdos.poll(now_ns)
 
+    def on_servo_tick(self, now_ns: int, *shaft_counts: int) -> None:
+        """One servo period of a drive that no machine moves, with the resolvers' counts since power-on."""
+        for axis, counts in zip(self.axes, shaft_counts, strict=True):
+            axis.on_tick(now_ns, counts)
+        self.after_servo_tick(now_ns)
+
     @property
     def position_demand_counts(self) -> float:
-        """Position demand at the last servo tick, in shaft counts."""
+        """Position demand of the first axis at the last servo tick, in shaft counts."""
         return self.axis.position_demand_counts
 
     @property
-    def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
-        """Torque to be added to the position controller's."""
-        return self.axis.torque_offset_Nm
-
-    @property
-    def torque_demand_Nm(self) -> float | None:  # noqa: N802 - the unit is part of the name
-        """Torque that a torque mode asks for, around the position controller; None in every other mode."""
-        return None if self.axis.torque_demand is None else self.axis.torque_demand_Nm
-
-    @property
-    def torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
-        """What max torque 6072h and the positive torque limit 60E0h allow."""
-        return self.axis.torque_limit_Nm
-
-    @property
-    def negative_torque_limit_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
-        """What 6072h and 60E1h allow in the negative direction, as a positive number."""
-        return self.axis.negative_torque_limit_Nm
-
-    @property
     def is_powered(self) -> bool:
-        """Whether the amplifier may put torque on the motor."""
-        return self.axis.is_powered
-
-    @property
-    def brake_released(self) -> bool:
-        """Whether the holding brake is open: exactly while there is torque to hold the axis."""
-        return self.axis.is_powered
-
-    @property
-    def gains(self) -> tuple[int, ...]:
-        """K_P, K_I, K_D, K_V, K_F of 3020h, over 256."""
-        return self.axis.gains
+        """Whether the amplifier of any axis may put torque on its motor."""
+        return any(axis.is_powered for axis in self.axes)
 
     @property
     def power_state(self) -> PowerState:
-        """State of the CiA 402 state machine."""
+        """State of the CiA 402 state machine of the first axis."""
         return self.axis.state
 
     @property
     def mode(self) -> Mode:
-        """Active mode of operation."""
+        """Active mode of operation of the first axis."""
         return self.axis.mode
 
     def time_of_day(self, now_ns: int) -> TimeOfDay | None:
         """What the TIME messages have told, carried on to ``now_ns``; None if none has come."""
         return self._time.now(now_ns)
 
-    def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
-        return self.axis.shaft_counts, 0.0, 0
+    def trip(
+        self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False, axis: int | None = None
+    ) -> None:
+        """Make an axis fault (by its number from 1; None: every one): EMCY, fault reaction, fault.
 
-    def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
-        """Make the drive fault: EMCY, fault reaction, fault. ``persists`` until ``end_trip`` is called.
-
-        A drive that is switched off notices nothing but a cause that persists, once it is on again.
+        ``persists`` until ``end_trip`` is called. A drive that is switched off notices nothing but a cause that
+        persists, once it is on again.
         """
-        if not self.is_switched_off:
-            self.axis.trip(error_code, error_register_bits, now_ns, persists=persists)
-        elif persists:
-            self._emergency.raise_error(error_code, error_register_bits, now_ns, is_fault=True, persists=True)
+        for each in self.axes:
+            if axis in (None, each.number):
+                each.trip(error_code, error_register_bits, now_ns, persists=persists)
 
-    def end_trip(self, error_code: int, now_ns: int) -> None:
+    def end_trip(self, error_code: int, now_ns: int, *, axis: int | None = None) -> None:
         """The cause of a persisting trip has gone, so that a fault reset is accepted again."""
-        self._emergency.end_cause(error_code, now_ns)
+        for each in self.axes:
+            if axis in (None, each.number):
+                each.end_warning(error_code, now_ns)
 
     def warn(self, error_code: int, error_register_bits: int, now_ns: int) -> None:
-        """Raise an error that does not lead to a fault; it lasts until ``end_trip`` is called."""
+        """Raise an error of the node that does not lead to a fault; it lasts until ``end_warning`` is called."""
         if not self.is_switched_off:
             self._emergency.raise_error(error_code, error_register_bits, now_ns, is_fault=False, persists=True)
+
+    def end_warning(self, error_code: int, now_ns: int) -> None:
+        """The cause of ``warn`` has gone."""
+        self._emergency.end_cause(error_code, now_ns)
 
     def lose_connection(self, now_ns: int) -> None:
         """The drive has been cut off from the bus: an enabled axis faults (8100h)."""
@@ -341,6 +334,8 @@ class Drive:
     def switch_off(self, now_ns: int) -> None:
         """Take the supply away: no torque, brake engaged, deaf and mute, and all that is in RAM is lost."""
         self.is_switched_off = True
+        for axis in self.axes:
+            axis.is_switched_off = True
         self._enter(NmtState.BOOT_UP, now_ns)
         self._reset(True, now_ns)
         self.outbox.clear()
@@ -350,6 +345,8 @@ class Drive:
         """Give the supply back: the drive boots."""
         if self.is_switched_off:
             self.is_switched_off = False
+            for axis in self.axes:
+                axis.is_switched_off = False
             self._is_powered_on = False
             self._boot_due_ns = now_ns
             self._is_wake_stale = True
@@ -373,8 +370,9 @@ class Drive:
 
     def _lose_connection(self, now_ns: int) -> None:
         """An axis that is enabled does not go on without its master."""
-        if self.axis.is_powered:
-            self.axis.lose_connection(EmergencyCode.COMMUNICATION, ErrorRegister.COMMUNICATION, now_ns)
+        for axis in self.axes:
+            if axis.is_powered:
+                axis.lose_connection(EmergencyCode.COMMUNICATION, ErrorRegister.COMMUNICATION, now_ns)
 
     def _reset(self, is_whole_node: bool, now_ns: int) -> None:
         self._take_node_id(self._persistent_node_id if is_whole_node else self._lss.pending_node_id, now_ns)
@@ -386,8 +384,10 @@ class Drive:
             self._emergency.end_cause(code, now_ns)
         if is_whole_node:
             self._emergency.forget()
-            self.cam_slots.restore()
-            self.axis.restore()
+            for slots in self._cam_slots:
+                slots.restore()
+            for axis in self.axes:
+                axis.restore()
             self._time.forget()
         self._emergency.restore()
         self._handlers = {}
@@ -438,7 +438,8 @@ class Drive:
             self._memory.apply(objects.DEVICE_TYPE, _LAST_COMMUNICATION_INDEX)
         for service in (self._emergency, self._sdo, self._producer, self._guard):
             service.set_node_id(node_id)
-        self.axis.node_id = node_id
+        for axis in self.axes:
+            axis.node_id = node_id
 
     def _tell_loss(self, reason: str, now_ns: int) -> None:
         if not self._emergency.is_active(EmergencyCode.PARAMETERS_LOST):
@@ -520,7 +521,13 @@ class Drive:
             if not self._consumer.has_lost and not self._guard.is_lost:
                 self._emergency.end_cause(EmergencyCode.HEARTBEAT, now_ns)
             return
-        self.axis.lose_connection(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, persists=True)
+        if not self.is_powered:
+            self._emergency.raise_error(
+                EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, is_fault=False, persists=True
+            )
+        for axis in self.axes:
+            if axis.is_powered:
+                axis.lose_connection(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, now_ns, persists=True)
         action = self._communication_error.value
         if action == 0 and self.nmt_state is NmtState.OPERATIONAL:
             self._enter(NmtState.PRE_OPERATIONAL, now_ns)

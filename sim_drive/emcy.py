@@ -1,15 +1,18 @@
-"""EMCY producer (CiA 301, 7.2.7) with the error register 1001h and the pre-defined error field 1003h."""
+"""EMCY producer (CiA 301, 7.2.7) with the error register 1001h and the pre-defined error field 1003h.
+
+A node has one of each; the error code 603Fh is each logical axis' own.
+"""
 
 import struct
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag, unique
 from typing import Final
 
 from drivers.frame import Frame
 from drivers.node import Event
-from drivers.objects import COB_ID_EMCY, ERROR_CODE, ERROR_REGISTER, INHIBIT_TIME_EMCY, PREDEFINED_ERROR_FIELD
+from drivers.objects import COB_ID_EMCY, ERROR_REGISTER, INHIBIT_TIME_EMCY, PREDEFINED_ERROR_FIELD
 from drivers.pdo import PDO_COB_ID_INVALID
 from drivers.sdo import AbortCode
 from sim_drive.cob_ids import COB_ID_MASK, is_refused
@@ -22,6 +25,8 @@ _EMCY: Final = struct.Struct("<HB5s")
 _INHIBIT_UNIT_NS: Final = 100_000
 _MAX_HELD_BACK: Final = 16
 """EMCY frames that wait for the inhibit time to pass; the oldest give way to more."""
+NODE: Final = 0
+"""In place of an axis: the error is the node's, and so every axis'."""
 
 
 @unique
@@ -69,6 +74,8 @@ class EmergencyRaised(Event):
     node_id: int
     code: int
     register: int
+    axis: int = NODE
+    """In a node of several axes: the number of the one that has the error."""
 
 
 @dataclass(slots=True)
@@ -79,12 +86,16 @@ class _ActiveError:
 
 
 class EmergencyProducer:
-    """Knows which errors are active, and tells of every change."""
+    """Knows which errors are active, and tells of every change.
+
+    In a node of several axes an error is the node's, or that of one axis, whose number is then the first of the EMCY's
+    vendor-specific bytes. ``of_axis`` is an axis' share in it.
+    """
 
     __slots__ = (
         "_active",
         "_cob_id",
-        "_code",
+        "_codes",
         "_events",
         "_free_at_ns",
         "_held_back",
@@ -98,13 +109,22 @@ class EmergencyProducer:
         "on_held_back",
     )
 
-    def __init__(self, node_id: int, dictionary: LiveDictionary, outbox: list[Frame], events: list[Event]) -> None:
+    def __init__(
+        self,
+        node_id: int,
+        dictionary: LiveDictionary,
+        outbox: list[Frame],
+        events: list[Event],
+        codes: Sequence[Entry],
+    ) -> None:
+        """``codes``: the error code 603Fh of each axis."""
         self._node_id = node_id
         self._outbox = outbox
         self._events = events
-        self._active: dict[int, _ActiveError] = {}
+        self._active: dict[tuple[int, int], _ActiveError] = {}
+        """By code and axis, oldest first."""
         self._register = dictionary.entry(ERROR_REGISTER)
-        self._code = dictionary.entry(ERROR_CODE)
+        self._codes = tuple(codes)
         self._cob_id = dictionary.entry(COB_ID_EMCY)
         self._cob_id.on_write = self._on_cob_id
         self._history = [dictionary.entry(PREDEFINED_ERROR_FIELD, n) for n in range(ERROR_HISTORY_LENGTH + 1)]
@@ -145,63 +165,82 @@ class EmergencyProducer:
         """Events tell another node id from now on; the COB-ID is 1014h's."""
         self._node_id = node_id
 
-    @property
-    def has_persisting_fault(self) -> bool:
-        """Whether the cause of an error is still there, so that a fault reset has to be refused."""
-        return any(error.persists for error in self._active.values())
+    def of_axis(self, number: int) -> "AxisErrors":
+        """The errors of axis ``number`` (from 1)."""
+        return AxisErrors(self, NODE if len(self._codes) == 1 else number)
+
+    def has_persisting_fault(self, axis: int) -> bool:
+        """Whether the cause of an error of an axis or of the node is still there: a fault reset has to be refused."""
+        return any(error.persists for (_, other), error in self._active.items() if other in (NODE, axis))
 
     def is_active(self, code: int) -> bool:
         """Whether this error has been raised and not cleared."""
-        return code in self._active
+        return any(code == active for active, _ in self._active)
 
     def restore(self) -> None:
         """Bring 1001h and 603Fh up to date after the dictionary's defaults were restored."""
         self._free_at_ns = 0
         self._register.value = self._combined_register()
-        self._code.value = next(reversed(self._active), int(EmergencyCode.NO_ERROR))
+        for axis, entry in self._code_entries(NODE):
+            own = (code for code, other in reversed(self._active) if axis == NODE or other in (NODE, axis))
+            entry.value = next(own, int(EmergencyCode.NO_ERROR))
 
     def forget(self) -> None:
         """Lose all errors without a word, save those whose cause persists."""
-        self._active = {code: error for code, error in self._active.items() if error.persists}
+        self._active = {key: error for key, error in self._active.items() if error.persists}
         self.restore()
 
-    def raise_error(self, code: int, register: int, now_ns: int, *, is_fault: bool, persists: bool) -> None:
+    def _code_entries(self, axis: int) -> list[tuple[int, Entry]]:
+        """The error codes 603Fh that an error of ``axis`` shows in, each with its axis as errors name it."""
+        if len(self._codes) == 1:
+            return [(NODE, self._codes[0])]
+        return [(number, entry) for number, entry in enumerate(self._codes, start=1) if axis in (NODE, number)]
+
+    def raise_error(
+        self, code: int, register: int, now_ns: int, *, is_fault: bool, persists: bool, axis: int = NODE
+    ) -> None:
         """Note an error and tell of it, unless it is active already.
 
         ``is_fault``: it stays active until a fault reset. ``persists``: its cause stays until ``end_cause``.
         """
-        known = self._active.get(code)
+        known = self._active.get((code, axis))
         if known is not None:
             known.is_fault = known.is_fault or is_fault
             known.persists = persists
             return
         # Plain integers from here on: enums have names for some values, and a log is to show the same for all.
         code = int(code)
-        self._active[code] = _ActiveError(int(register | ErrorRegister.GENERIC), is_fault, persists)
-        self._code.value = code
+        self._active[code, axis] = _ActiveError(int(register | ErrorRegister.GENERIC), is_fault, persists)
+        for _, entry in self._code_entries(axis):
+            entry.value = code
         history = self._history
         for place in range(ERROR_HISTORY_LENGTH, 1, -1):
             history[place].value = history[place - 1].value
         history[1].value = code
         history[0].value = min(history[0].value + 1, ERROR_HISTORY_LENGTH)
-        self._tell(code, now_ns)
+        self._tell(code, now_ns, axis)
 
-    def end_cause(self, code: int, now_ns: int) -> None:
-        """The cause of an error has gone: the error is over, unless it has led to a fault that is still to be reset."""
-        error = self._active.get(code)
-        if error is None:
-            return
-        error.persists = False
-        if not error.is_fault:
-            del self._active[code]
-            self._tell_recovery(now_ns)
+    def end_cause(self, code: int, now_ns: int, axis: int | None = None) -> None:
+        """The cause of an error has gone: the error is over, unless it has led to a fault that is still to be reset.
 
-    def reset_fault(self, now_ns: int) -> None:
-        """Clear every error (there must be none that persists), as a fault reset does."""
-        if self._active:
-            self._active.clear()
+        ``axis``: whose error it is; None: everybody's.
+        """
+        for key in [key for key in self._active if key[0] == code and (axis is None or key[1] == axis)]:
+            error = self._active[key]
+            error.persists = False
+            if not error.is_fault:
+                del self._active[key]
+                self._tell_recovery(now_ns)
+
+    def reset_fault(self, axis: int, now_ns: int) -> None:
+        """Clear every error of an axis and of the node (there must be none that persists), as a fault reset does."""
+        cleared = [key for key in self._active if key[1] in (NODE, axis)]
+        for key in cleared:
+            del self._active[key]
+        if cleared:
             self._tell_recovery(now_ns)
-        self._code.value = int(EmergencyCode.NO_ERROR)
+        for _, entry in self._code_entries(axis):
+            entry.value = int(EmergencyCode.NO_ERROR)
 
     def _combined_register(self) -> int:
         self.has_errors = bool(self._active)
@@ -214,16 +253,16 @@ class EmergencyProducer:
         if self._active:
             self._register.value = self._combined_register()
         else:
-            self._tell(int(EmergencyCode.NO_ERROR), now_ns)
+            self._tell(int(EmergencyCode.NO_ERROR), now_ns, NODE)
 
-    def _tell(self, code: int, now_ns: int) -> None:
+    def _tell(self, code: int, now_ns: int, axis: int) -> None:
         register = self._combined_register()
         self._register.value = register
-        self._events.append(EmergencyRaised(now_ns, self._node_id, code, register))
+        self._events.append(EmergencyRaised(now_ns, self._node_id, code, register, axis))
         cob_id = self._cob_id.value
         if self._is_silent or cob_id & PDO_COB_ID_INVALID:
             return
-        frame = Frame(cob_id & COB_ID_MASK, _EMCY.pack(code, register, b"\0\0\0\0\0"))
+        frame = Frame(cob_id & COB_ID_MASK, _EMCY.pack(code, register, bytes((axis,))))
         if now_ns < self._free_at_ns or self._held_back:
             self._held_back.append(frame)
             self.on_held_back()
@@ -250,6 +289,33 @@ class EmergencyProducer:
             return entry.value if number <= self._history[0].value else AbortCode.NO_DATA_AVAILABLE
 
         return read
+
+
+class AxisErrors:
+    """The errors of one axis; its only one in most nodes, whose errors are then the node's."""
+
+    __slots__ = ("_number", "_producer")
+
+    def __init__(self, producer: EmergencyProducer, number: int) -> None:
+        self._producer = producer
+        self._number = number
+
+    @property
+    def has_persisting_fault(self) -> bool:
+        """Whether the cause of an error is still there, so that a fault reset has to be refused."""
+        return self._producer.has_persisting_fault(self._number)
+
+    def raise_error(self, code: int, register: int, now_ns: int, *, is_fault: bool, persists: bool) -> None:
+        """See EmergencyProducer."""
+        self._producer.raise_error(code, register, now_ns, is_fault=is_fault, persists=persists, axis=self._number)
+
+    def end_cause(self, code: int, now_ns: int) -> None:
+        """See EmergencyProducer."""
+        self._producer.end_cause(code, now_ns, self._number)
+
+    def reset_fault(self, now_ns: int) -> None:
+        """See EmergencyProducer."""
+        self._producer.reset_fault(self._number, now_ns)
 
 
 def _no_matter() -> None:

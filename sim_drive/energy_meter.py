@@ -4,21 +4,20 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers import objects
-from sim_drive.dictionary import LiveDictionary
 from sim_drive.driveline import AxisEnergy
-from sim_drive.motion import wrap_int32
+from sim_drive.motion import Motion, wrap_int32
 
 _MJ_PER_J: Final = 1000.0
 
 
-def attach_energy_meter(dictionary: LiveDictionary, energy: Callable[[], AxisEnergy]) -> None:
-    """Let 3040h of ``dictionary`` show what ``energy`` tells; INTEGER32, so modulo 2^32 mJ."""
+def attach_energy_meter(axis: Motion, energy: Callable[[], AxisEnergy]) -> None:
+    """Let 3040h of ``axis`` show what ``energy`` tells; INTEGER32, so modulo 2^32 mJ."""
 
     def show(subindex: int, tell: Callable[[AxisEnergy], float]) -> None:
         def read(now_ns: int) -> int:
             return wrap_int32(round(tell(energy()) * _MJ_PER_J))
 
-        dictionary.entry(objects.DRIVE_ENERGY, subindex).on_read = read
+        axis.entry(objects.DRIVE_ENERGY, subindex).on_read = read
 
     show(1, lambda now: now.drawn)
     show(2, lambda now: now.shaft)

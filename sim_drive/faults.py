@@ -9,6 +9,7 @@ from typing import Final
 from drivers.nmt import MAX_NODE_ID
 from drivers.sdo import AbortCode
 from sim_drive.emcy import ErrorRegister
+from sim_drive.logical_axes import MAX_AXES
 
 MAX_COB_ID: Final = 0x7FF
 MAX_TIME_S: Final = 1e6
@@ -105,18 +106,22 @@ _SELECTION: Final = ("cob_id", "cob_id_mask", "direction", "probability", "count
 _IDENTITY: Final = ("vendor_id", "product_code", "revision_number", "serial_number")
 
 FAULTS: Final[Mapping[FaultKind, FaultDescription]] = {
-    FaultKind.OVER_CURRENT: FaultDescription("trips with EMCY 2310h, torque off at once", optional=("error_code",)),
-    FaultKind.OVER_VOLTAGE: FaultDescription("trips with EMCY 3210h", optional=("error_code",)),
-    FaultKind.UNDER_VOLTAGE: FaultDescription("trips with EMCY 3220h", optional=("error_code",)),
-    FaultKind.OVER_TEMPERATURE: FaultDescription("trips with EMCY 4310h", optional=("error_code",)),
-    FaultKind.RESOLVER_LOSS: FaultDescription("trips with EMCY 7305h, torque off at once", optional=("error_code",)),
-    FaultKind.FOLLOWING_ERROR: FaultDescription("trips with EMCY 8611h", optional=("error_code",)),
-    FaultKind.SAFE_TORQUE_OFF: FaultDescription(
-        "trips with EMCY FF30h, torque off at once, no fault reset until it ends", optional=("error_code",)
+    FaultKind.OVER_CURRENT: FaultDescription(
+        "trips with EMCY 2310h, torque off at once", optional=("error_code", "axis")
     ),
-    FaultKind.FROZEN_RESOLVER: FaultDescription("the resolver shows what it showed when it froze"),
-    FaultKind.JUMPING_RESOLVER: FaultDescription("the resolver shows so many counts too much", ("counts",)),
-    FaultKind.BROKEN_BRAKE: FaultDescription("the holding brake does not hold"),
+    FaultKind.OVER_VOLTAGE: FaultDescription("trips with EMCY 3210h", optional=("error_code", "axis")),
+    FaultKind.UNDER_VOLTAGE: FaultDescription("trips with EMCY 3220h", optional=("error_code", "axis")),
+    FaultKind.OVER_TEMPERATURE: FaultDescription("trips with EMCY 4310h", optional=("error_code", "axis")),
+    FaultKind.RESOLVER_LOSS: FaultDescription(
+        "trips with EMCY 7305h, torque off at once", optional=("error_code", "axis")
+    ),
+    FaultKind.FOLLOWING_ERROR: FaultDescription("trips with EMCY 8611h", optional=("error_code", "axis")),
+    FaultKind.SAFE_TORQUE_OFF: FaultDescription(
+        "trips with EMCY FF30h, torque off at once, no fault reset until it ends", optional=("error_code", "axis")
+    ),
+    FaultKind.FROZEN_RESOLVER: FaultDescription("the resolver shows what it showed when it froze", optional=("axis",)),
+    FaultKind.JUMPING_RESOLVER: FaultDescription("the resolver shows so many counts too much", ("counts",), ("axis",)),
+    FaultKind.BROKEN_BRAKE: FaultDescription("the holding brake does not hold", optional=("axis",)),
     FaultKind.MUTE_HEARTBEAT: FaultDescription("no heartbeat is sent, nor a boot-up message"),
     FaultKind.NODE_RESET: FaultDescription("the drive resets itself, and boots", has_end=False),
     FaultKind.POWER_CYCLE: FaultDescription("no supply: silent, brake engaged, RAM lost; boots at the end"),
@@ -154,6 +159,8 @@ class Fault:
     """How long it lasts; None: to the end of the run (a trip: see ``Trip.lasts``)."""
     error_code: int | None = None
     """EMCY code in place of the usual one."""
+    axis: int | None = None
+    """In a node of several logical axes: the number of the one that is concerned, from 1; None: every one."""
     counts: int | None = None
     delay_s: float | None = None
     index: int | None = None
@@ -218,6 +225,7 @@ _BOUNDS: Final[tuple[tuple[str, float, float], ...]] = (
     ("at_s", 0.0, MAX_TIME_S),
     ("for_s", 0.0, MAX_TIME_S),
     ("error_code", 1, _MAX_UNSIGNED16),
+    ("axis", 1, MAX_AXES),
     ("counts", -MAX_COUNTS, MAX_COUNTS),
     ("delay_s", 0.0, MAX_DELAY_S),
     ("index", 1, _MAX_UNSIGNED16),

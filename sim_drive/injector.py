@@ -73,35 +73,16 @@ class _FrameFault:
         return True
 
 
-class _Tap:
-    """Between one drive and its surroundings; a `sim_drive.machine.DriveTap`."""
+class _AxisTap:
+    """Between one axis and its motor; a `sim_drive.machine.AxisTap`."""
 
-    __slots__ = (
-        "_frozen",
-        "_injector",
-        "_last",
-        "added_counts",
-        "drive",
-        "frame_faults",
-        "is_brake_broken",
-        "is_cut_off",
-        "is_mute",
-        "place",
-        "sdo_delay_ns",
-    )
+    __slots__ = ("_frozen", "_last", "added_counts", "is_brake_broken")
 
-    def __init__(self, injector: "Injector", place: int, drive: Drive) -> None:
-        self._injector = injector
-        self.place = place
+    def __init__(self) -> None:
         self._last = 0
         self._frozen: int | None = None
-        self.drive = drive
         self.added_counts = 0
         self.is_brake_broken = False
-        self.is_cut_off = False
-        self.is_mute = False
-        self.sdo_delay_ns = 0
-        self.frame_faults: list[_FrameFault] = []
 
     def freeze(self, is_frozen: bool) -> None:
         """Let the resolver show, from now on, what it showed last."""
@@ -112,6 +93,22 @@ class _Tap:
             return self._frozen
         self._last = counts + self.added_counts
         return self._last
+
+
+class _Tap:
+    """Between one drive and its surroundings; a `sim_drive.machine.DriveTap`."""
+
+    __slots__ = ("_injector", "axes", "drive", "frame_faults", "is_cut_off", "is_mute", "place", "sdo_delay_ns")
+
+    def __init__(self, injector: "Injector", place: int, drive: Drive) -> None:
+        self._injector = injector
+        self.place = place
+        self.drive = drive
+        self.axes = tuple(_AxisTap() for _ in drive.axes)
+        self.is_cut_off = False
+        self.is_mute = False
+        self.sdo_delay_ns = 0
+        self.frame_faults: list[_FrameFault] = []
 
     def hear(self, frame: Frame, now_ns: int) -> Sequence[Frame]:
         if self.is_cut_off or self.drive.is_switched_off:
@@ -161,6 +158,7 @@ class _Turn:
     """A fault begins or ends."""
 
     fault: Fault
+    tap: _Tap
     is_start: bool
 
 
@@ -179,7 +177,8 @@ class Injector:
     what falls to the machine: a fault at 0 s is there before the drives boot. Frames are lost, late, doubled or
     reordered where the single drive meets the bus, so that other drives are not concerned. Several faults may be at
     work at once: what two of the same kind do lasts until both are over; of two that cannot be had together
-    (identities, delays of SDO) the later one counts.
+    (identities, delays of SDO) the later one counts. A fault's node is the drive that has its node id when the fault is
+    given, and stays that drive if LSS makes another node of it.
     """
 
     def __init__(self, machine: EmulatedMachine, faults: Iterable[Fault] = (), seed: int = 0) -> None:
@@ -196,30 +195,27 @@ class Injector:
             self._taps.append(_Tap(self, place, drive))
         for place, tap in enumerate(self._taps):
             machine.put_tap(place, tap)
-        self._tap_of: Final = {tap.drive.node_id: tap for tap in self._taps}
         self._agenda: list[tuple[int, int, _Turn | _HeldFrame]] = []
         self._number = count()
         self._held: set[int] = set()
-        self._active: list[Fault] = []
+        self._active: list[tuple[_Tap, Fault]] = []
         self._events: list[Event] = []
         self._start_ns: int | None = None
-        self._waiting = list(faults)
-        for fault in self._waiting:
-            self._check(fault)
+        self._waiting = [(self._find(fault), fault) for fault in faults]
 
     @property
     def active(self) -> tuple[Fault, ...]:
         """Faults that have begun and not ended, oldest first; trips that are over at once are not among them."""
-        return tuple(self._active)
+        return tuple(fault for _, fault in self._active)
 
     def inject(self, fault: Fault, now_ns: int) -> None:
         """Let ``fault`` begin ``fault.at_s`` after ``now_ns``, the host's present.
 
         On a virtual bus it is done between two runs. Raises ValueError for a node that the machine does not have.
         """
-        self._check(fault)
+        tap = self._find(fault)
         self._begin(now_ns)
-        self._plan(fault, now_ns)
+        self._plan(tap, fault, now_ns)
         self._work_off(now_ns)
 
     # -- the seam ------------------------------------------------------------------------------------------------
@@ -273,15 +269,15 @@ class Injector:
     def _begin(self, now_ns: int) -> None:
         if self._start_ns is None:
             self._start_ns = now_ns
-            for fault in self._waiting:
-                self._plan(fault, now_ns)
+            for tap, fault in self._waiting:
+                self._plan(tap, fault, now_ns)
             self._waiting.clear()
 
-    def _plan(self, fault: Fault, from_ns: int) -> None:
+    def _plan(self, tap: _Tap, fault: Fault, from_ns: int) -> None:
         at_ns = from_ns + round(fault.at_s * _NS_PER_S)
-        self._put(at_ns, _Turn(fault, True))
+        self._put(at_ns, _Turn(fault, tap, True))
         if fault.for_s is not None:
-            self._put(at_ns + max(1, round(fault.for_s * _NS_PER_S)), _Turn(fault, False))
+            self._put(at_ns + max(1, round(fault.for_s * _NS_PER_S)), _Turn(fault, tap, False))
 
     def _put(self, at_ns: int, item: _Turn | _HeldFrame) -> int:
         number = next(self._number)
@@ -306,23 +302,30 @@ class Injector:
 
     # -- faults --------------------------------------------------------------------------------------------------
 
-    def _check(self, fault: Fault) -> None:
-        if fault.node_id not in self._tap_of:
-            known = ", ".join(str(node_id) for node_id in sorted(self._tap_of))
+    def _find(self, fault: Fault) -> _Tap:
+        """Where the fault is to be made. Raises ValueError if there is no such node or axis."""
+        taps = {tap.drive.node_id: tap for tap in self._taps}
+        tap = taps.get(fault.node_id)
+        if tap is None:
+            known = ", ".join(str(node_id) for node_id in sorted(taps))
             raise ValueError(f"{fault.kind.value}: the machine has no node {fault.node_id} (there are: {known})")
+        if fault.axis is not None and fault.axis > len(tap.axes):
+            axes = "1 axis" if len(tap.axes) == 1 else f"{len(tap.axes)} axes"
+            raise ValueError(f"{fault.kind.value}: axis {fault.axis}: node {fault.node_id} has {axes}")
+        return tap
 
     def _turn(self, turn: _Turn, now_ns: int) -> None:
         fault = turn.fault
-        tap = self._tap_of[fault.node_id]
+        tap = turn.tap
         if turn.is_start:
-            self._active.append(fault)
+            self._active.append((tap, fault))
             self._events.append(FaultStarted(now_ns, fault))
             self._start(fault, tap, now_ns)
             if self._is_momentary(fault):
-                self._active.remove(fault)
+                self._active.remove((tap, fault))
                 self._events.append(FaultEnded(now_ns, fault))
         else:
-            self._active.remove(fault)
+            self._active.remove((tap, fault))
             self._events.append(FaultEnded(now_ns, fault))
             self._end(fault, tap, now_ns)
         self._set_tap(fault.kind, tap)
@@ -354,21 +357,21 @@ class Injector:
 
     def _trip(self, fault: Fault, drive: Drive, now_ns: int) -> None:
         trip = TRIPS[fault.kind]
-        reaction = drive.dictionary.entry(objects.FAULT_REACTION_OPTION_CODE)
-        wanted = reaction.value
-        if trip.is_torque_off:
-            reaction.value = _DISABLE
-        code = trip.error_code if fault.error_code is None else fault.error_code
-        drive.trip(code, trip.error_register, now_ns, persists=not self._is_momentary(fault))
-        reaction.value = wanted
+        for axis in drive.axes:
+            if not _concerns(fault, axis.number):
+                continue
+            reaction = axis.entry(objects.FAULT_REACTION_OPTION_CODE)
+            wanted = reaction.value
+            if trip.is_torque_off:
+                reaction.value = _DISABLE
+            axis.trip(_code_of(fault), trip.error_register, now_ns, persists=not self._is_momentary(fault))
+            reaction.value = wanted
 
     def _end(self, fault: Fault, tap: _Tap, now_ns: int) -> None:
         drive = tap.drive
         goes_on = any(other.kind is fault.kind for other in self._of(tap))
         if fault.kind in TRIPS:
-            codes = {_code_of(other) for other in self._of(tap) if other.kind in TRIPS}
-            if _code_of(fault) not in codes:
-                drive.end_trip(_code_of(fault), now_ns)
+            self._end_trip(fault, tap, now_ns)
         elif fault.kind in FRAME_FAULTS:
             self._end_frame_fault(fault, tap, now_ns)
         elif goes_on:
@@ -378,9 +381,17 @@ class Injector:
         elif fault.kind is FaultKind.BUS_OFF:
             tap.is_cut_off = False
             drive.warn(BUS_OFF_RECOVERED, _COMMUNICATION, now_ns)
-            drive.end_trip(BUS_OFF_RECOVERED, now_ns)
+            drive.end_warning(BUS_OFF_RECOVERED, now_ns)
         elif fault.kind is FaultKind.ERROR_PASSIVE:
-            drive.end_trip(ERROR_PASSIVE, now_ns)
+            drive.end_warning(ERROR_PASSIVE, now_ns)
+
+    def _end_trip(self, fault: Fault, tap: _Tap, now_ns: int) -> None:
+        """The cause is gone for every axis that no other fault trips with the same code."""
+        code = _code_of(fault)
+        same = [other for other in self._of(tap) if other.kind in TRIPS and _code_of(other) == code]
+        for axis in tap.drive.axes:
+            if _concerns(fault, axis.number) and not any(_concerns(other, axis.number) for other in same):
+                tap.drive.end_trip(code, now_ns, axis=axis.number)
 
     def _end_frame_fault(self, fault: Fault, tap: _Tap, now_ns: int) -> None:
         active = next(active for active in tap.frame_faults if active.fault == fault)
@@ -390,18 +401,20 @@ class Injector:
                 self._let_pass(_HeldFrame(tap.place, frame, direction), now_ns)
 
     def _of(self, tap: _Tap) -> list[Fault]:
-        return [fault for fault in self._active if fault.node_id == tap.drive.node_id]
+        return [fault for concerned, fault in self._active if concerned is tap]
 
     def _set_tap(self, kind: FaultKind, tap: _Tap) -> None:
         """Bring the tap in line with the faults of this kind that are at work."""
         faults = [fault for fault in self._of(tap) if fault.kind is kind]
-        if kind is FaultKind.FROZEN_RESOLVER:
-            tap.freeze(bool(faults))
-        elif kind is FaultKind.JUMPING_RESOLVER:
-            tap.added_counts = sum(fault.counts or 0 for fault in faults)
-        elif kind is FaultKind.BROKEN_BRAKE:
-            tap.is_brake_broken = bool(faults)
-        elif kind is FaultKind.MUTE_HEARTBEAT:
+        for number, axis_tap in enumerate(tap.axes, start=1):
+            own = [fault for fault in faults if _concerns(fault, number)]
+            if kind is FaultKind.FROZEN_RESOLVER:
+                axis_tap.freeze(bool(own))
+            elif kind is FaultKind.JUMPING_RESOLVER:
+                axis_tap.added_counts = sum(fault.counts or 0 for fault in own)
+            elif kind is FaultKind.BROKEN_BRAKE:
+                axis_tap.is_brake_broken = bool(own)
+        if kind is FaultKind.MUTE_HEARTBEAT:
             tap.is_mute = bool(faults)
         elif kind is FaultKind.SLOW_SDO:
             tap.sdo_delay_ns = _span_ns(faults[-1].delay_s) if faults else 0
@@ -423,6 +436,10 @@ class Injector:
             entry = drive.dictionary.entry(objects.IDENTITY, subindex)
             entry.default = value
             entry.value = value
+
+
+def _concerns(fault: Fault, axis: int) -> bool:
+    return fault.axis in (None, axis)
 
 
 def _code_of(fault: Fault) -> int:

@@ -34,25 +34,12 @@ Latch = Callable[[int], tuple[int, float, int]]
 """Actual values at an instant (ns): position in counts, velocity in counts/s, torque in per mille of rated torque."""
 
 
-class MachineDrive(Protocol):
-    """What the machine needs of a drive; `sim_drive.drive` has the real one."""
-
-    subscriptions_changed: bool
-    """Set by the drive when `cob_ids` has changed, reset by the machine."""
-
-    @property
-    def outbox(self) -> list[Frame]:
-        """Frames to send, oldest first; always the same list, which the machine empties in place."""
-        ...
-
-    @property
-    def events(self) -> list[Event]:
-        """Events, oldest first; always the same list, which the machine empties in place."""
-        ...
+class DriveAxis(Protocol):
+    """What the machine needs of one axis of a drive; `sim_drive.axis` has the real one."""
 
     @property
     def latch(self) -> Latch:
-        """Set by the machine: what the drive's resolver and amplifier show at an instant."""
+        """Set by the machine: what the axis' resolver and amplifier show at an instant."""
         ...
 
     @latch.setter
@@ -70,15 +57,36 @@ class MachineDrive(Protocol):
     @property
     def is_powered(self) -> bool: ...
     @property
-    def brake_released(self) -> bool: ...
+    def is_brake_released(self) -> bool: ...
     @property
     def gains(self) -> Sequence[int]: ...
+    def on_tick(self, now_ns: int, shaft_counts: int) -> None: ...
+    def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None: ...
+
+
+class MachineDrive(Protocol):
+    """What the machine needs of a drive, a node of one or more axes; `sim_drive.drive` has the real one."""
+
+    subscriptions_changed: bool
+    """Set by the drive when `cob_ids` has changed, reset by the machine."""
+
+    @property
+    def axes(self) -> Sequence[DriveAxis]: ...
+    @property
+    def outbox(self) -> list[Frame]:
+        """Frames to send, oldest first; always the same list, which the machine empties in place."""
+        ...
+
+    @property
+    def events(self) -> list[Event]:
+        """Events, oldest first; always the same list, which the machine empties in place."""
+        ...
+
     def cob_ids(self) -> set[int]: ...
     def receive(self, frame: Frame, now_ns: int) -> None: ...
     def next_wake_ns(self) -> int | None: ...
     def wake(self, now_ns: int) -> None: ...
-    def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None: ...
-    def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None: ...
+    def after_servo_tick(self, now_ns: int) -> None: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,8 +156,8 @@ class TickRecord(NamedTuple):
     """Energy that the axis has drawn from its supply, see `AxisEnergy`."""
 
 
-class DriveTap(Protocol):
-    """What may stand between a drive and its surroundings, to make faults; see `EmulatedMachine.put_tap`."""
+class AxisTap(Protocol):
+    """What may stand between an axis and its motor, to make faults."""
 
     @property
     def is_brake_broken(self) -> bool:
@@ -157,7 +165,16 @@ class DriveTap(Protocol):
         ...
 
     def show(self, counts: int) -> int:
-        """What the drive is shown in place of the resolver's counts."""
+        """What the axis is shown in place of the resolver's counts."""
+        ...
+
+
+class DriveTap(Protocol):
+    """What may stand between a drive and its surroundings, to make faults; see `EmulatedMachine.put_tap`."""
+
+    @property
+    def axes(self) -> Sequence[AxisTap]:
+        """One for each axis of the drive."""
         ...
 
     def hear(self, frame: Frame, now_ns: int) -> Sequence[Frame]:
@@ -170,33 +187,27 @@ class DriveTap(Protocol):
 
 
 class _Motor:
-    """One axis of the machine: its drive, scaling and servo loop, and the resolver at the last servo tick."""
+    """One axis of the machine: of a drive and of the plant, with scaling and servo loop, and the resolver's last."""
 
     __slots__ = (
         "axis",
         "counts",
         "counts_per_rad",
         "delayed_torque",
-        "drive",
-        "due_ns",
+        "drive_axis",
         "eccentricity",
-        "events",
         "index",
         "is_powered",
-        "next_wake_ns",
         "noise",
-        "outbox",
         "permille_per_Nm",
-        "receive",
         "servo",
         "tap",
         "velocity",
-        "wake_ns",
     )
 
-    def __init__(self, index: int, drive: MachineDrive, axis: MachineAxis) -> None:
+    def __init__(self, index: int, drive_axis: DriveAxis, axis: MachineAxis) -> None:
         self.index = index
-        self.drive = drive
+        self.drive_axis = drive_axis
         self.axis = axis
         self.servo = ServoLoop(axis.demand_resolution)
         self.counts_per_rad = axis.counts_per_revolution / (2.0 * pi)
@@ -209,16 +220,7 @@ class _Motor:
         self.is_powered = False
         self.delayed_torque = 0.0
         """Torque command of the last servo tick, with an output delay."""
-        self.tap: DriveTap | None = None
-        self.wake_ns: int | None = None
-        """When the drive wanted to be woken when it was asked last."""
-        self.due_ns = _NEVER
-        """When it will be woken."""
-        # Looked up once: they are asked for at every frame and tick.
-        self.receive = drive.receive
-        self.next_wake_ns = drive.next_wake_ns
-        self.outbox = drive.outbox
-        self.events = drive.events
+        self.tap: AxisTap | None = None
 
     def quantise(self, angle_rad: float) -> int:
         """What the resolver shows at this angle."""
@@ -228,6 +230,38 @@ class _Motor:
         counts = floor(reading)
         return counts if self.tap is None else self.tap.show(counts)
 
+
+class _Station:
+    """One drive on the bus, and the motors that it has."""
+
+    __slots__ = (
+        "after_servo_tick",
+        "drive",
+        "due_ns",
+        "events",
+        "motors",
+        "next_wake_ns",
+        "outbox",
+        "receive",
+        "tap",
+        "wake_ns",
+    )
+
+    def __init__(self, drive: MachineDrive, motors: Sequence[_Motor]) -> None:
+        self.drive = drive
+        self.motors = tuple(motors)
+        self.tap: DriveTap | None = None
+        self.wake_ns: int | None = None
+        """When the drive wanted to be woken when it was asked last."""
+        self.due_ns = _NEVER
+        """When it will be woken."""
+        # Looked up once: they are asked for at every frame and tick.
+        self.receive = drive.receive
+        self.next_wake_ns = drive.next_wake_ns
+        self.after_servo_tick = drive.after_servo_tick
+        self.outbox = drive.outbox
+        self.events = drive.events
+
     def receive_through_tap(self, frame: Frame, now_ns: int) -> None:
         if self.tap is not None:
             for heard in self.tap.hear(frame, now_ns):
@@ -235,11 +269,12 @@ class _Motor:
 
 
 class EmulatedMachine:
-    """Drives and plant as one core (`drivers.node.Node`); drive i moves axis i of the plant.
+    """Drives and plant as one core (`drivers.node.Node`); the drives' axes move those of the plant in their order.
 
-    At a servo tick the plant is first advanced to it under the torques commanded at the tick before. Then each drive
-    in turn is shown its resolver and asked for its demand, from which its servo loop makes the torque for the coming
-    period. A drive that is not powered gets no torque, and its servo loop starts anew, without a jump, when it is.
+    At a servo tick the plant is first advanced to it under the torques commanded at the tick before. Then each axis of
+    each drive in turn is shown its resolver and asked for its demand, from which its servo loop makes the torque for
+    the coming period. An axis that is not powered gets no torque, and its servo loop starts anew, without a jump, when
+    it is.
 
     Frames are dispatched by COB-ID. What one drive sends, the other drives of the machine hear too, as on a wire, but
     at once rather than after its time on the wire: after all drives have taken the frame or tick that caused it, so
@@ -261,6 +296,7 @@ class EmulatedMachine:
         "_noise_source",
         "_routes",
         "_start_ns",
+        "_stations",
         "_tick",
         "_tick_ns",
         "_torques",
@@ -283,18 +319,23 @@ class EmulatedMachine:
 
         ``record_ticks``: how many of the last servo ticks `records` keeps; 0 keeps none and costs nothing.
 
-        Raises ValueError where the numbers of drives, axes and the plant's axes differ.
+        Raises ValueError where the numbers of the drives' axes, ``axes`` and the plant's axes differ.
         """
-        if not len(drives) == len(axes) == plant.axis_count:
-            raise ValueError(f"{len(drives)} drives and {len(axes)} axes for a plant of {plant.axis_count} axes")
+        count = sum(len(drive.axes) for drive in drives)
+        if not count == len(axes) == plant.axis_count:
+            raise ValueError(
+                f"drives of {count} axes and {len(axes)} scalings of axes for a plant of {plant.axis_count} axes"
+            )
         self.drives: Final = tuple(drives)
         self.plant: Final = plant
         self.axes: Final = tuple(axes)
         self.records: Final = deque[TickRecord](maxlen=record_ticks)
-        count = len(self.drives)
+        drive_axes = [axis for drive in self.drives for axis in drive.axes]
         self._motors: Final = tuple(
-            _Motor(index, drive, axis) for index, (drive, axis) in enumerate(zip(drives, axes, strict=True))
+            _Motor(index, *pair) for index, pair in enumerate(zip(drive_axes, axes, strict=True))
         )
+        motors = iter(self._motors)
+        self._stations: Final = tuple(_Station(drive, [next(motors) for _ in drive.axes]) for drive in self.drives)
         self._noise_source = Random(seed)  # noqa: S311 - reproducible on purpose
         self._torques = [0.0] * count
         self._brakes = [True] * count
@@ -307,11 +348,12 @@ class EmulatedMachine:
         """The next servo tick or the earliest wake of a drive."""
         self._frames: list[Frame] = []
         self._events: list[Event] = []
-        self._routes: dict[int, tuple[_Motor, ...]] = {}
+        self._routes: dict[int, tuple[_Station, ...]] = {}
         for motor in self._motors:
             motor.counts = motor.quantise(plant.angle(motor.index))
-            motor.drive.latch = self._latch_of(motor)
-            self._ask_wake(motor)
+            motor.drive_axis.latch = self._latch_of(motor)
+        for station in self._stations:
+            self._ask_wake(station)
         self._read_subscriptions()
 
     @property
@@ -323,30 +365,32 @@ class EmulatedMachine:
         """The servo loop of an axis, for diagnosis."""
         return self._motors[axis].servo
 
-    def put_tap(self, axis: int, tap: DriveTap) -> None:
-        """Put ``tap`` between the drive of an axis and all that it hears, sends and measures, for good."""
-        motor = self._motors[axis]
-        motor.tap = tap
-        motor.receive = motor.receive_through_tap
+    def put_tap(self, place: int, tap: DriveTap) -> None:
+        """Put ``tap`` between the drive at ``place`` and all that it hears, sends and measures, for good."""
+        station = self._stations[place]
+        station.tap = tap
+        station.receive = station.receive_through_tap
+        for motor, axis_tap in zip(station.motors, tap.axes, strict=True):
+            motor.tap = axis_tap
 
-    def deliver(self, axis: int, frame: Frame, now_ns: int) -> None:
+    def deliver(self, place: int, frame: Frame, now_ns: int) -> None:
         """Let a drive hear a frame that its tap has held back."""
-        motor = self._motors[axis]
-        motor.drive.receive(frame, now_ns)
-        self._ask_wake(motor)
+        station = self._stations[place]
+        station.drive.receive(frame, now_ns)
+        self._ask_wake(station)
         self._exchange(now_ns)
 
-    def transmit(self, axis: int, frame: Frame, now_ns: int) -> None:
+    def transmit(self, place: int, frame: Frame, now_ns: int) -> None:
         """Put a frame of a drive on the bus that its tap has held back."""
         self._frames.append(frame)
         if frame.cob_id in self._routes:
-            self._tell_others(self._motors[axis], frame, now_ns)
+            self._tell_others(self._stations[place], frame, now_ns)
         self._exchange(now_ns)
 
     def refresh(self, now_ns: int) -> None:
         """Ask every drive for its frames, events and next wake, after something outside has changed one."""
-        for motor in self._motors:
-            self._ask_wake(motor)
+        for station in self._stations:
+            self._ask_wake(station)
         self._exchange(now_ns)
 
     def receive(self, frame: Frame, now_ns: int) -> None:
@@ -356,11 +400,11 @@ class EmulatedMachine:
         listeners = self._routes.get(frame.cob_id)
         if listeners is None:
             return
-        for motor in listeners:
-            motor.receive(frame, now_ns)
-            wake_ns = motor.next_wake_ns()
-            if wake_ns != motor.wake_ns:
-                self._set_wake(motor, wake_ns)
+        for station in listeners:
+            station.receive(frame, now_ns)
+            wake_ns = station.next_wake_ns()
+            if wake_ns != station.wake_ns:
+                self._set_wake(station, wake_ns)
         self._listen(now_ns)
 
     def next_wake_ns(self) -> int | None:
@@ -375,7 +419,7 @@ class EmulatedMachine:
             if self._due_ns == self._next_tick_ns:
                 self._run_tick(self._due_ns)
             else:
-                due = next(motor for motor in self._motors if motor.due_ns == self._due_ns)
+                due = next(station for station in self._stations if station.due_ns == self._due_ns)
                 self._wake_drive(due, self._due_ns)
 
     def take_frames(self) -> list[Frame]:
@@ -392,83 +436,87 @@ class EmulatedMachine:
             self._events = []
         return events
 
-    def _ask_wake(self, motor: _Motor) -> None:
-        self._set_wake(motor, motor.next_wake_ns())
+    def _ask_wake(self, station: _Station) -> None:
+        self._set_wake(station, station.next_wake_ns())
 
-    def _set_wake(self, motor: _Motor, wake_ns: int | None) -> None:
-        motor.wake_ns = wake_ns
-        motor.due_ns = _NEVER if wake_ns is None else wake_ns
+    def _set_wake(self, station: _Station, wake_ns: int | None) -> None:
+        station.wake_ns = wake_ns
+        station.due_ns = _NEVER if wake_ns is None else wake_ns
         self._find_due()
 
     def _find_due(self) -> None:
-        self._due_ns = min(self._next_tick_ns, *[motor.due_ns for motor in self._motors])
+        self._due_ns = min(self._next_tick_ns, *[station.due_ns for station in self._stations])
 
-    def _wake_drive(self, motor: _Motor, due_ns: int) -> None:
+    def _wake_drive(self, station: _Station, due_ns: int) -> None:
         # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
         at_ns = due_ns if due_ns > self._tick_ns else self._tick_ns
         for _ in range(_MAX_WAKES_PER_INSTANT):
-            motor.drive.wake(at_ns)
-            self._ask_wake(motor)
-            if motor.due_ns > at_ns:
+            station.drive.wake(at_ns)
+            self._ask_wake(station)
+            if station.due_ns > at_ns:
                 break
         else:
             # A drive that always wants more at one instant must not stop the others: it goes on at the next tick.
-            self._set_wake(motor, self._next_tick_ns)
+            self._set_wake(station, self._next_tick_ns)
         self._exchange(at_ns)
 
     def _run_tick(self, now_ns: int) -> None:
         plant = self.plant
-        torques = self._torques
-        brakes = self._brakes
-        plant.advance(torques, brakes)
+        plant.advance(self._torques, self._brakes)
         self._tick += 1
         self._tick_ns = now_ns
         self._next_tick_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
         self._find_due()
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
-        for motor in self._motors:
-            index = motor.index
-            drive = motor.drive
-            axis = motor.axis
-            if axis.resolver_noise_counts > 0.0:
-                motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
-            tap = motor.tap
-            counts = motor.quantise(plant.angle(index))
-            motor.velocity = velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
-            motor.counts = counts
-            drive.on_servo_tick(now_ns, counts, velocity)
-            brakes[index] = not drive.brake_released and (tap is None or not tap.is_brake_broken)
-            if drive.is_powered:
-                demand = drive.position_demand_counts
-                if not motor.is_powered:
-                    self._power_on(motor, demand, now_ns)
-                torque = drive.torque_demand_Nm
-                if torque is None:
-                    torque = motor.servo.update(
-                        demand,
-                        counts,
-                        drive.gains,
-                        drive.torque_offset_Nm,
-                        axis.torque_per_volt,
-                        drive.torque_limit_Nm,
-                        drive.negative_torque_limit_Nm,
-                    )
-                else:
-                    # The controller is to start without a bump when it gets the axis back.
-                    motor.servo.reset(demand, counts)
-                if axis.output_delay_periods:
-                    torque, motor.delayed_torque = motor.delayed_torque, torque
-                torques[index] = torque
-            else:
-                motor.is_powered = False
-                torques[index] = motor.delayed_torque = 0.0
-            wake_ns = motor.next_wake_ns()
-            if wake_ns != motor.wake_ns:
-                self._set_wake(motor, wake_ns)
+        for station in self._stations:
+            for motor in station.motors:
+                self._run_servo(motor, now_ns)
+            station.after_servo_tick(now_ns)
+            wake_ns = station.next_wake_ns()
+            if wake_ns != station.wake_ns:
+                self._set_wake(station, wake_ns)
         if self.records.maxlen:
             self._record(now_ns)
         self._listen(now_ns)
+
+    def _run_servo(self, motor: _Motor, now_ns: int) -> None:
+        """Show an axis its resolver, and let its controller make the torque for the coming servo period."""
+        index = motor.index
+        drive_axis = motor.drive_axis
+        axis = motor.axis
+        if axis.resolver_noise_counts > 0.0:
+            motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
+        counts = motor.quantise(self.plant.angle(index))
+        tap = motor.tap
+        motor.velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
+        motor.counts = counts
+        drive_axis.on_tick(now_ns, counts)
+        self._brakes[index] = not drive_axis.is_brake_released and (tap is None or not tap.is_brake_broken)
+        if not drive_axis.is_powered:
+            motor.is_powered = False
+            self._torques[index] = motor.delayed_torque = 0.0
+            return
+        demand = drive_axis.position_demand_counts
+        if not motor.is_powered:
+            self._power_on(motor, demand, now_ns)
+        torque = drive_axis.torque_demand_Nm
+        if torque is None:
+            torque = motor.servo.update(
+                demand,
+                counts,
+                drive_axis.gains,
+                drive_axis.torque_offset_Nm,
+                axis.torque_per_volt,
+                drive_axis.torque_limit_Nm,
+                drive_axis.negative_torque_limit_Nm,
+            )
+        else:
+            # The controller is to start without a bump when it gets the axis back.
+            motor.servo.reset(demand, counts)
+        if axis.output_delay_periods:
+            torque, motor.delayed_torque = motor.delayed_torque, torque
+        self._torques[index] = torque
 
     def _power_on(self, motor: _Motor, demand_counts: float, now_ns: int) -> None:
         """The drive has switched its amplifier on since the tick before."""
@@ -476,12 +524,12 @@ class EmulatedMachine:
         motor.servo.reset(demand_counts, motor.counts)
         if self._has_tripped:
             # Neither a fault reset nor switching the drive off and on mends a torn linkage.
-            motor.drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
+            motor.drive_axis.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
     def _listen(self, now_ns: int) -> None:
         """Let the drives hear each other if any of them has something to say."""
-        for motor in self._motors:
-            if motor.outbox or motor.events or motor.drive.subscriptions_changed:
+        for station in self._stations:
+            if station.outbox or station.events or station.drive.subscriptions_changed:
                 self._exchange(now_ns)
                 return
 
@@ -489,38 +537,38 @@ class EmulatedMachine:
         """Collect what the drives have sent and noticed, and let them hear each other."""
         for _ in range(_MAX_CROSS_ROUNDS):
             is_quiet = True
-            for motor in self._motors:
-                if motor.drive.subscriptions_changed:
+            for station in self._stations:
+                if station.drive.subscriptions_changed:
                     self._read_subscriptions()
-                if motor.events:
-                    self._events += motor.events
-                    motor.events.clear()
-                if motor.outbox:
-                    frames = motor.outbox.copy()
-                    motor.outbox.clear()
-                    if motor.tap is not None:
-                        frames = [told for frame in frames for told in motor.tap.tell(frame, now_ns)]
+                if station.events:
+                    self._events += station.events
+                    station.events.clear()
+                if station.outbox:
+                    frames = station.outbox.copy()
+                    station.outbox.clear()
+                    if station.tap is not None:
+                        frames = [told for frame in frames for told in station.tap.tell(frame, now_ns)]
                     self._frames += frames
                     for frame in frames:
                         if frame.cob_id in self._routes:
                             is_quiet = False
-                            self._tell_others(motor, frame, now_ns)
+                            self._tell_others(station, frame, now_ns)
             # Drives that answer each other without end go on at the next tick: on a wire it would cost them time too.
             if is_quiet:
                 return
 
-    def _tell_others(self, sender: _Motor, frame: Frame, now_ns: int) -> None:
-        for motor in self._routes[frame.cob_id]:
-            if motor is not sender:
-                motor.receive(frame, now_ns)
-                self._ask_wake(motor)
+    def _tell_others(self, sender: _Station, frame: Frame, now_ns: int) -> None:
+        for station in self._routes[frame.cob_id]:
+            if station is not sender:
+                station.receive(frame, now_ns)
+                self._ask_wake(station)
 
     def _read_subscriptions(self) -> None:
-        routes: dict[int, tuple[_Motor, ...]] = {}
-        for motor in self._motors:
-            motor.drive.subscriptions_changed = False
-            for cob_id in sorted(motor.drive.cob_ids()):
-                routes[cob_id] = (*routes.get(cob_id, ()), motor)
+        routes: dict[int, tuple[_Station, ...]] = {}
+        for station in self._stations:
+            station.drive.subscriptions_changed = False
+            for cob_id in sorted(station.drive.cob_ids()):
+                routes[cob_id] = (*routes.get(cob_id, ()), station)
         self._routes = routes
 
     def _latch_of(self, motor: _Motor) -> Latch:
@@ -544,10 +592,10 @@ class EmulatedMachine:
 
     def _trip_all(self, torn_at_s: float, now_ns: int) -> None:
         self._has_tripped = True
-        angles = tuple(self.plant.angle(axis) for axis in range(len(self.drives)))
+        angles = tuple(self.plant.angle(motor.index) for motor in self._motors)
         self._events.append(LinkageTorn(now_ns, torn_at_s, angles))
-        for drive in self.drives:
-            drive.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
+        for motor in self._motors:
+            motor.drive_axis.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
     def _skip_to(self, now_ns: int) -> None:
         """Let the last servo tick not after ``now_ns`` be the next one."""
@@ -559,18 +607,18 @@ class EmulatedMachine:
         self._tick_ns = self._start_ns + self._tick * TWO_SERVO_PERIODS_NS // 2
         self._next_tick_ns = self._start_ns + tick * TWO_SERVO_PERIODS_NS // 2
         # Wakes missed meanwhile are due once, now, not once for every period they have missed.
-        for motor in self._motors:
-            motor.due_ns = max(motor.due_ns, self._next_tick_ns)
+        for station in self._stations:
+            station.due_ns = max(station.due_ns, self._next_tick_ns)
         self._find_due()
 
     def _record(self, now_ns: int) -> None:
-        axes = range(len(self.drives))
+        axes = range(len(self._motors))
         self.records.append(
             TickRecord(
                 now_ns,
                 tuple(self.plant.angle(axis) for axis in axes),
                 tuple(motor.counts for motor in self._motors),
-                tuple(drive.position_demand_counts for drive in self.drives),
+                tuple(motor.drive_axis.position_demand_counts for motor in self._motors),
                 tuple(self._torques),
                 tuple(self.plant.torque(axis) for axis in axes),
                 tuple(self.plant.axis_energy(axis).drawn for axis in axes),

@@ -15,6 +15,7 @@ from drivers import objects
 from sim_drive.cia402 import STOP_RAMPS, Statusword, StopRamp
 from sim_drive.demand import Demand
 from sim_drive.dictionary import Entry, LiveDictionary
+from sim_drive.logical_axes import of_axis
 from sim_drive.settings import DriveSettings
 
 Latch = Callable[[int], tuple[int, float, int]]
@@ -22,8 +23,6 @@ Latch = Callable[[int], tuple[int, float, int]]
 
 _WRAP: Final = 1 << 32
 _HALF: Final = 1 << 31
-_FIRST_PROFILE_INDEX: Final = 0x6000
-_LAST_PROFILE_INDEX: Final = 0x67FF
 _S_PER_NS: Final = 1e-9
 _TWO_TICKS_S: Final = 0.002
 """Room for the servo tick at which braking is found to be due, and the one before it."""
@@ -51,7 +50,6 @@ class Motion(ABC):
 
     __slots__ = (
         "_acceleration",
-        "_base",
         "_deceleration",
         "_halt_option",
         "_max_acceleration",
@@ -69,6 +67,7 @@ class Motion(ABC):
         "latch",
         "limit_high",
         "limit_low",
+        "number",
         "offset",
         "period_ns",
         "period_s",
@@ -80,14 +79,14 @@ class Motion(ABC):
         "torque_demand",
     )
 
-    def __init__(self, dictionary: LiveDictionary, settings: DriveSettings, base: int = 0) -> None:
-        """``base`` is added to the indices 6000h to 67FFh of the profile area: n times 800h for logical axis n."""
+    def __init__(self, dictionary: LiveDictionary, settings: DriveSettings, number: int = 1) -> None:
+        """``number``: which logical axis of its node it is, from 1."""
         self.dictionary: Final = dictionary
-        self._base: Final = base
+        self.number: Final = number
         self.settings: Final = settings
         self.demand: Final = Demand()
-        self.latch: Latch = _no_latch
-        """Set by the drive."""
+        self.latch: Latch = self._last_tick
+        """The machine puts the plant's here."""
         self.source = SetPointSource.SDO
         """Set by whoever writes into the dictionary, around the writing."""
         self.shaft_counts = 0
@@ -122,9 +121,10 @@ class Motion(ABC):
 
     def entry(self, index: int, subindex: int = 0) -> Entry:
         """The entry of an object of the axis, by its index in the first axis."""
-        if _FIRST_PROFILE_INDEX <= index <= _LAST_PROFILE_INDEX:
-            index += self._base
-        return self.dictionary.entry(index, subindex)
+        return self.dictionary.entry(of_axis(index, self.number), subindex)
+
+    def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
+        return self.shaft_counts, 0.0, 0
 
     @abstractmethod
     def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
@@ -289,7 +289,3 @@ class Motion(ABC):
         reference = floor(demand)
         distance = position - self.offset - reference
         return reference + ((distance + _HALF) % _WRAP) - _HALF
-
-
-def _no_latch(now_ns: int) -> tuple[int, float, int]:
-    return 0, 0.0, 0

@@ -11,6 +11,7 @@ from drivers.node import Event
 from drivers.object_dictionary import decode, encode
 from drivers.sdo import AbortCode
 from sim_drive.dictionary import Entry, LiveDictionary
+from sim_drive.logical_axes import in_first_axis
 
 Place = tuple[int, int]
 """Index and sub-index."""
@@ -222,7 +223,7 @@ def is_storable(entry: Entry) -> bool:
         and variable.access.is_readable
         and variable.size is not None
         and variable.index >= objects.DEVICE_TYPE
-        and variable.index not in VOLATILE_OBJECTS
+        and in_first_axis(variable.index) not in VOLATILE_OBJECTS
     )
 
 

@@ -1,6 +1,6 @@
 """The exchange of PDOs: which of the drive's PDOs a SYNC, an event or a remote request concerns, and SYNC itself."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from drivers import objects
@@ -10,10 +10,11 @@ from sim_drive.axis import Axis, SetPointSource
 from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import LiveDictionary
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
+from sim_drive.logical_axes import PDO_STEP, in_first_axis, of_axis
 from sim_drive.pdo_slave import ReceivePdo, TransmitPdo
 
 PDO_COUNT: Final = 4
-"""RPDOs and TPDOs that the drive has, each."""
+"""RPDOs and TPDOs that an axis has, each."""
 
 FrameHandler = Callable[[bytes, int], None]
 """Takes a frame's data and the time."""
@@ -23,6 +24,8 @@ RequestHandler = Callable[[int], None]
 _NS_PER_US: Final = 1_000
 _RESERVED_COUNTER_OVERFLOW: Final = 1
 _SYNC_GENERATE: Final = 1 << 30
+
+_POSITION_AND_TORQUE: Final = frozenset({objects.POSITION_ACTUAL_VALUE, objects.TORQUE_ACTUAL_VALUE})
 
 # Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
 _SDO: Final = SetPointSource.SDO
@@ -34,14 +37,14 @@ class PdoExchange:
 
     __slots__ = (
         "_acts_on_receipt",
-        "_axis",
+        "_axes",
         "_counter_overflow",
         "_emergency",
         "_monitored_rpdos",
         "_on_change",
         "_on_timer",
         "_rpdos",
-        "_sample",
+        "_samplers",
         "_sync_at_ns",
         "_sync_cob_id",
         "_sync_period",
@@ -57,7 +60,7 @@ class PdoExchange:
     def __init__(
         self,
         dictionary: LiveDictionary,
-        axis: Axis,
+        axes: Sequence[Axis],
         outbox: list[Frame],
         emergency: EmergencyProducer,
         on_change: Callable[[], None],
@@ -69,17 +72,18 @@ class PdoExchange:
         ``on_change()``: the handlers have changed; ``on_timer()``: ``next_wake_ns`` may have become earlier.
         ``acts_on_receipt``: synchronous RPDOs do not wait for the SYNC, as on some real drives.
         """
-        self._axis = axis
+        self._axes = tuple(axes)
         self._emergency = emergency
         self._on_change = on_change
         self._on_timer = on_timer
         self._acts_on_receipt = acts_on_receipt
-        numbers = range(1, PDO_COUNT + 1)
-        self._rpdos = [ReceivePdo(number, dictionary, axis, emergency, self.rearrange) for number in numbers]
-        self._tpdos = [TransmitPdo(number, dictionary, axis, outbox, self.rearrange) for number in numbers]
+        numbers = [PDO_STEP * (axis.number - 1) + n for axis in self._axes for n in range(1, PDO_COUNT + 1)]
+        self._rpdos = [ReceivePdo(number, dictionary, self._axes, emergency, self.rearrange) for number in numbers]
+        self._tpdos = [TransmitPdo(number, dictionary, self._axes, outbox, self.rearrange) for number in numbers]
         self._sync_rpdos: tuple[ReceivePdo, ...] = ()
         self._sync_tpdos: tuple[TransmitPdo, ...] = ()
-        self._sample = axis.sample
+        self._samplers: tuple[Callable[[int], None], ...] = ()
+        """What a SYNC has sampled, for its TPDOs to send."""
         self.event_tpdos: tuple[TransmitPdo, ...] = ()
         """Those that ``poll`` has something to do with."""
         self._waiting_tpdos: tuple[TransmitPdo, ...] = ()
@@ -131,8 +135,12 @@ class PdoExchange:
         self._waiting_tpdos = tuple(waiting)
         self._sync_tpdos = tuple(tpdo for tpdo in synchronous if tpdo not in waiting)
         measured = {entry.variable.index for tpdo in synchronous for entry in tpdo.entries if entry.on_read is not None}
-        is_position_alone = measured <= {objects.POSITION_ACTUAL_VALUE, objects.TORQUE_ACTUAL_VALUE}
-        self._sample = self._axis.sample_actual_position if is_position_alone else self._axis.sample
+        samplers: list[Callable[[int], None]] = []
+        for axis in self._axes:
+            own = {first for first in map(in_first_axis, measured) if of_axis(first, axis.number) in measured}
+            if own:
+                samplers.append(axis.sample_actual_position if own <= _POSITION_AND_TORQUE else axis.sample)
+        self._samplers = tuple(samplers)
 
     # -- timers --------------------------------------------------------------------------------------------------
 
@@ -198,10 +206,12 @@ class PdoExchange:
             pending = rpdo.pending
             if pending is not None:
                 rpdo.pending = None
-                self._axis.source = _SYNC
+                for axis in self._axes:
+                    axis.source = _SYNC
                 rpdo.apply(pending, now_ns)
-                self._axis.on_sync(now_ns)
-                self._axis.source = _SDO
+                for axis in self._axes:
+                    axis.on_sync(now_ns)
+                    axis.source = _SDO
 
         return handle
 
@@ -251,18 +261,20 @@ class PdoExchange:
             return
         if self._emergency.has_errors:
             self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
-        axis = self._axis
-        self._sample(now_ns)
+        for sample in self._samplers:
+            sample(now_ns)
         for tpdo in self._sync_tpdos:
             tpdo.on_sync(now_ns)
-        axis.source = _SYNC
+        for axis in self._axes:
+            axis.source = _SYNC
         for rpdo in self._sync_rpdos:
             pending = rpdo.pending
             if pending is not None:
                 rpdo.pending = None
                 rpdo.apply(pending, now_ns)
-        axis.on_sync(now_ns)
-        axis.source = _SDO
+        for axis in self._axes:
+            axis.on_sync(now_ns)
+            axis.source = _SDO
 
     def _on_noted_sync(self, data: bytes, now_ns: int) -> None:
         """A SYNC with counter, or with a synchronous window after it."""

@@ -20,6 +20,7 @@ from sim_drive.axis import Axis, SetPointSource
 from sim_drive.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_restricted
 from sim_drive.dictionary import Entry, LiveDictionary, WriteHook
 from sim_drive.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
+from sim_drive.logical_axes import in_first_axis
 
 LAST_SYNCHRONOUS_TYPE: Final = 240
 SYNCHRONOUS_ON_REQUEST: Final = 252
@@ -261,7 +262,7 @@ class ReceivePdo(_Pdo):
     """An RPDO: its data act at once, or wait for the SYNC. With an event timer it is missed if it does not come."""
 
     __slots__ = (
-        "_axis",
+        "_axes",
         "_emergency",
         "_event_entry",
         "_steps",
@@ -277,14 +278,14 @@ class ReceivePdo(_Pdo):
         self,
         number: int,
         dictionary: LiveDictionary,
-        axis: Axis,
+        axes: Sequence[Axis],
         emergency: EmergencyProducer,
         on_change: Callable[[int], None],
     ) -> None:
-        """``number`` counts from 1."""
+        """``number``, from 1, is the PDO's; it may map objects of any of ``axes``."""
         communication = objects.RPDO_COMMUNICATION + number - 1
         super().__init__(dictionary, communication, objects.RPDO_MAPPING + number - 1, on_change)
-        self._axis = axis
+        self._axes = axes
         self._emergency = emergency
         self._event_entry = dictionary.entry(communication, _Sub.EVENT_TIMER)
         self._event_entry.on_write = self._on_event_timer
@@ -338,9 +339,11 @@ class ReceivePdo(_Pdo):
         if self.is_synchronous:
             self.pending = data
         else:
-            self._axis.source = SetPointSource.EVENT_PDO
+            for axis in self._axes:
+                axis.source = SetPointSource.EVENT_PDO
             self.apply(data, now_ns)
-            self._axis.source = SetPointSource.SDO
+            for axis in self._axes:
+                axis.source = SetPointSource.SDO
 
     def _take_wrong_length(self, data: bytes, now_ns: int) -> None:
         code = EmergencyCode.PDO_TOO_SHORT if len(data) < self.length else EmergencyCode.PDO_TOO_LONG
@@ -359,7 +362,7 @@ class TransmitPdo(_Pdo):
     """A TPDO: sent at SYNCs, on events with inhibit and event time, or on remote requests."""
 
     __slots__ = (
-        "_axis",
+        "_axes",
         "_event_entry",
         "_event_ns",
         "_inhibit_entry",
@@ -382,14 +385,14 @@ class TransmitPdo(_Pdo):
         self,
         number: int,
         dictionary: LiveDictionary,
-        axis: Axis,
+        axes: Sequence[Axis],
         outbox: list[Frame],
         on_change: Callable[[int], None],
     ) -> None:
-        """``number`` counts from 1."""
+        """``number``, from 1, is the PDO's; it may map objects of any of ``axes``."""
         communication = objects.TPDO_COMMUNICATION + number - 1
         super().__init__(dictionary, communication, objects.TPDO_MAPPING + number - 1, on_change)
-        self._axis = axis
+        self._axes = axes
         self._outbox = outbox
         self._inhibit_entry = dictionary.entry(communication, _Sub.INHIBIT_TIME)
         self._event_entry = dictionary.entry(communication, _Sub.EVENT_TIMER)
@@ -414,7 +417,7 @@ class TransmitPdo(_Pdo):
 
     def _take_codec(self, codec: _Codec) -> None:
         self._pack = codec.pack
-        self._sources = tuple(entry for entry in self.entries if entry.variable.index not in _MEASURED)
+        self._sources = tuple(entry for entry in self.entries if in_first_axis(entry.variable.index) not in _MEASURED)
 
     def _start(self, now_ns: int) -> None:
         self.is_event_driven = self.transmission_type in EVENT_DRIVEN_TYPES
@@ -470,7 +473,7 @@ class TransmitPdo(_Pdo):
     def on_request(self, now_ns: int) -> None:
         """Answer a remote frame: type 252 with the sample of the last SYNC (there may be none yet), others afresh."""
         if self.transmission_type != SYNCHRONOUS_ON_REQUEST:
-            self._axis.sample(now_ns)
+            self._sample(now_ns)
             self.send(now_ns)
         elif self._sampled is not None:
             self._outbox.append(Frame(self.cob_id, self._sampled))
@@ -488,11 +491,15 @@ class TransmitPdo(_Pdo):
         """Send what the timers have let go."""
         if self.due_ns is None or now_ns < self.due_ns:
             return
-        self._axis.sample(now_ns)
+        self._sample(now_ns)
         self.send(now_ns)
         self._is_pending = False
         self.inhibited_until_ns = now_ns + self._inhibit_ns
         self._schedule(now_ns)
+
+    def _sample(self, now_ns: int) -> None:
+        for axis in self._axes:
+            axis.sample(now_ns)
 
     def _schedule(self, now_ns: int) -> None:
         if self._is_pending:

@@ -13,6 +13,7 @@ from drivers.pdo import PDO_COB_ID_NO_RTR, MappingEntry
 from drivers.sdo import AbortCode
 from sim_drive.cia402 import Mode
 from sim_drive.dictionary import Entry
+from sim_drive.logical_axes import in_first_axis
 
 if TYPE_CHECKING:
     from sim_drive.drive import Drive
@@ -120,12 +121,13 @@ def _change_remap_abort_code(drive: "Drive") -> None:
 
 
 def _refuse_homing_method_0(drive: "Drive") -> None:
-    _refuse_values(drive.dictionary.entry(objects.HOMING_METHOD), lambda value: value == 0)
+    for axis in drive.axes:
+        _refuse_values(axis.entry(objects.HOMING_METHOD), lambda value: value == 0)
 
 
 def _take_milliseconds_alone(drive: "Drive") -> None:
-    entry = drive.dictionary.entry(objects.INTERPOLATION_TIME_PERIOD, 2)
-    _refuse_values(entry, lambda value: value != _MILLISECONDS)
+    for axis in drive.axes:
+        _refuse_values(axis.entry(objects.INTERPOLATION_TIME_PERIOD, 2), lambda value: value != _MILLISECONDS)
 
 
 def _need_cycle_period(drive: "Drive") -> None:
@@ -134,19 +136,21 @@ def _need_cycle_period(drive: "Drive") -> None:
     def check(value: int) -> AbortCode | None:
         return AbortCode.CANNOT_STORE_DEVICE_STATE if value in _CYCLIC_MODES and not period.value else None
 
-    _refuse(drive.dictionary.entry(objects.MODES_OF_OPERATION), check)
+    for axis in drive.axes:
+        _refuse(axis.entry(objects.MODES_OF_OPERATION), check)
 
 
 def _remove_cyclic_position(drive: "Drive") -> None:
     mode = int(Mode.CYCLIC_SYNCHRONOUS_POSITION)
-    supported = drive.dictionary.entry(objects.SUPPORTED_DRIVE_MODES)
-    supported.default = supported.value = supported.value & ~(1 << (mode - 1))
-    _refuse_values(drive.dictionary.entry(objects.MODES_OF_OPERATION), lambda value: value == mode)
+    for axis in drive.axes:
+        supported = axis.entry(objects.SUPPORTED_DRIVE_MODES)
+        supported.default = supported.value = supported.value & ~(1 << (mode - 1))
+        _refuse_values(axis.entry(objects.MODES_OF_OPERATION), lambda value: value == mode)
 
 
 def _refuse_torque_offset(drive: "Drive") -> None:
     def check(value: int) -> AbortCode | None:
-        is_it = bool(value) and MappingEntry.from_word(value).index == objects.TORQUE_OFFSET
+        is_it = bool(value) and in_first_axis(MappingEntry.from_word(value).index) == objects.TORQUE_OFFSET
         return AbortCode.NOT_PDO_MAPPABLE if is_it else None
 
     for first_index in (objects.RPDO_MAPPING, objects.TPDO_MAPPING):

@@ -39,6 +39,7 @@ class FaultSection(Model):
     at_s: _Number = 0.0
     for_s: _Number | None = None
     error_code: _Whole | None = None
+    axis: _Whole | None = None
     counts: _Whole | None = None
     delay_s: _Number | None = None
     index: _Whole | None = None

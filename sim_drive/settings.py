@@ -42,5 +42,7 @@ class DriveSettings:
     """From power-on or a reset to the boot-up message."""
     quirks: frozenset[Quirk] = frozenset()
     """Habits of real drives that it has."""
+    further_axes: tuple["DriveSettings", ...] = ()
+    """Logical axes of the node beside the first, 7 at most; of theirs counts what concerns an axis."""
     parameter_file: Path | None = None
     """Where parameters are stored (1010h) over the end of the process; None: nowhere."""

@@ -9,12 +9,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import tau
 
-from drivers.eds import load_eds
+from drivers.eds import describe_any_node
 from drivers.frame import Frame
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
 from sim_drive.assembly import FREE_AXIS, FREE_AXIS_GAINS, SHIPPED_EDS
 from sim_drive.drive import Drive
+from sim_drive.logical_axes import eds_of_axes
 from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.plant import FreeAxisPlant
 from sim_drive.settings import DriveSettings
@@ -23,26 +24,28 @@ MS = 1_000_000
 
 
 @functools.cache
-def described(node_id: int) -> ObjectDictionary:
-    return load_eds(SHIPPED_EDS, node_id)
+def described(node_id: int, axes: int = 1) -> ObjectDictionary:
+    return describe_any_node(SHIPPED_EDS, lambda text: eds_of_axes(text, axes))(node_id)
 
 
 def build(node_ids: Sequence[int], settings: DriveSettings | None, noise_counts: float) -> EmulatedMachine:
     """As ``free_machine`` does, with the EDS read once, and resolvers that may be noisy; serial number = node id."""
     common = DriveSettings(gains=FREE_AXIS_GAINS) if settings is None else settings
+    axes = len(common.further_axes) + 1
     drives = [
         Drive(
             node_id,
-            described(node_id),
+            described(node_id, axes),
             replace(common, identity=replace(common.identity, serial_number=node_id)),
             decode_cam_image,
-            describe=described,
+            describe=functools.partial(described, axes=axes),
         )
         for node_id in node_ids
     ]
     axis = MachineAxis(rated_torque_Nm=common.rated_torque_Nm, resolver_noise_counts=noise_counts)
-    plant = FreeAxisPlant([FREE_AXIS] * len(drives), [0.0] * len(drives))
-    return EmulatedMachine(drives, plant, [axis] * len(drives))
+    count = axes * len(drives)
+    plant = FreeAxisPlant([FREE_AXIS] * count, [0.0] * count)
+    return EmulatedMachine(drives, plant, [axis] * count)
 
 
 def text_of(frame: Frame) -> str:

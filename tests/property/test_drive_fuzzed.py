@@ -49,7 +49,7 @@ def decode(image: bytes) -> CamTable:
 def new_drive() -> Drive:
     drive = Drive(NODE, DESCRIPTION, DriveSettings(), decode)
     drive.wake(0)
-    drive.on_servo_tick(0, 0, 0.0)
+    drive.on_servo_tick(0, 0)
     drive.take_frames()
     return drive
 
@@ -78,7 +78,7 @@ def moving_drive(mode: int) -> Drive:
     write(drive, 0x1400, 2, 1, 1)
     write(drive, 0x1400, 1, 0x205, 4)
     write(drive, 0x6060, 0, mode, 1)
-    drive.on_servo_tick(0, 0, 0.0)
+    drive.on_servo_tick(0, 0)
     drive.receive(Frame(0x000, bytes((0x01, NODE))), 0)
     for word in (0x06, 0x07, 0x0F):
         write(drive, 0x6040, 0, word, 2)
@@ -131,7 +131,7 @@ def test_no_frame_breaks_the_drive(start: str, script: list[tuple[Frame, int, in
     drive = STARTS[start]()
     now_ns = 0
     shaft = 0
-    drive.latch = lambda now_ns: (shaft, shaft * 1.5, shaft)
+    drive.axis.latch = lambda now_ns: (shaft, shaft * 1.5, shaft)
     for frame, wait_ns, shaft_counts in script:
         now_ns += wait_ns
         shaft = shaft_counts
@@ -143,7 +143,7 @@ def test_no_frame_breaks_the_drive(start: str, script: list[tuple[Frame, int, in
         else:
             raise AssertionError("the drive does not let the time go on")
         drive.receive(frame, now_ns)
-        drive.on_servo_tick(now_ns, shaft, 0.0)
+        drive.on_servo_tick(now_ns, shaft)
         for sent in drive.take_frames():
             assert 0 < sent.cob_id < 0x800
             assert len(sent.data) <= 8
@@ -153,7 +153,7 @@ def test_no_frame_breaks_the_drive(start: str, script: list[tuple[Frame, int, in
             PowerState.FAULT_REACTION_ACTIVE,
         }
         assert drive.is_powered or drive.position_demand_counts == shaft
-        assert drive.is_powered or drive.torque_offset_Nm == 0.0
+        assert drive.is_powered or drive.axis.torque_offset_Nm == 0.0
     drive.receive(Frame(0x000, bytes((0x80, NODE))), now_ns)
     # Within a block download everything but an abort is a segment.
     drive.receive(Frame(0x605, bytes.fromhex("8000000000000008")), now_ns)

@@ -123,6 +123,6 @@ def test_after_all_faults_the_drives_answer_as_ever(drawn: list[Fault], seed: in
     for place, drive in enumerate(machine.drives):
         assert isinstance(drive, Drive)
         assert not drive.is_powered
-        shown, _, _ = drive.latch(bus.now_ns)
+        shown, _, _ = drive.axis.latch(bus.now_ns)
         angle_counts = machine.plant.angle(place) * 4096 / 6.283185307179586
         assert abs(shown - angle_counts) <= 1.0, "neither frozen nor displaced"

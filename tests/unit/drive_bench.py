@@ -80,7 +80,7 @@ class Bench:
         end_ns = self.now_ns + span_ns
         while self.now_ns < end_ns:
             self.now_ns += TICK_NS
-            self.drive.on_servo_tick(self.now_ns, self.shaft, 0.0)
+            self.drive.on_servo_tick(self.now_ns, self.shaft)
             if self.follows and self.drive.is_powered:
                 self.shaft = round(self.drive.position_demand_counts)
             self.wake()

@@ -20,7 +20,7 @@ def make_pair() -> tuple[Bench, Bench]:
     cv.map_cyclic()
     cv.enable()
     cv.follows = True
-    cv.drive.latch = lambda now_ns: (cv.shaft, 0.0, 0)
+    cv.drive.axis.latch = lambda now_ns: (cv.shaft, 0.0, 0)
     servo = Bench(node_id=2, decode=decode_cam_image)
     assert servo.download(0x3000, 1, IMAGE) == 0
     servo.must(0x3000, 2, 1, 1)

@@ -136,7 +136,7 @@ def test_not_ready_goes_on_by_itself():
 def test_power_and_brake_in_each_state(state: PowerState):
     bench = bench_in(state)
     assert bench.drive.is_powered is (state in {ENABLED, QUICK, REACTION})
-    assert bench.drive.brake_released is bench.drive.is_powered
+    assert bench.drive.axis.is_brake_released is bench.drive.is_powered
 
 
 def test_last_writer_of_the_controlword_wins():

@@ -23,7 +23,7 @@ def cyclic_bench(settings: DriveSettings | None = None, mode: int = 8) -> Bench:
 
 def demand_at(bench: Bench, after_ns: int) -> float:
     """The demand ``after_ns`` from the bench's time, without letting that time pass."""
-    bench.drive.on_servo_tick(bench.now_ns + after_ns, bench.shaft, 0.0)
+    bench.drive.on_servo_tick(bench.now_ns + after_ns, bench.shaft)
     return bench.drive.position_demand_counts
 
 
@@ -181,12 +181,12 @@ def test_targets_wrap_with_the_position():
 def test_torque_offset_is_per_mille_of_rated_torque_and_only_while_enabled():
     bench = cyclic_bench(DriveSettings(rated_torque_Nm=2.0))
     bench.set_point(0x0F, 0, -250)
-    assert bench.drive.torque_offset_Nm == 0.0
+    assert bench.drive.axis.torque_offset_Nm == 0.0
     bench.sync()
-    assert bench.drive.torque_offset_Nm == pytest.approx(-0.5)
-    assert bench.drive.torque_limit_Nm == pytest.approx(6.0)
+    assert bench.drive.axis.torque_offset_Nm == pytest.approx(-0.5)
+    assert bench.drive.axis.torque_limit_Nm == pytest.approx(6.0)
     bench.control(0x07)
-    assert bench.drive.torque_offset_Nm == 0.0
+    assert bench.drive.axis.torque_offset_Nm == 0.0
 
 
 def test_demand_follows_the_shaft_while_off():

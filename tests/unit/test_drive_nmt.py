@@ -120,7 +120,7 @@ def test_reset_node_restores_everything_but_the_slots(bench: Bench):
     assert bench.statusword & 0x6F == 0x40
     assert bench.read(0x6065) == 512
     assert bench.read(0x3010) == 0
-    assert bench.drive.gains == (256, 0, 0, 0, 0)
+    assert bench.drive.axis.gains == (256, 0, 0, 0, 0)
     assert bench.read(0x3001, 3) == 2
     assert bench.read(0x3001, 6) == 7
 

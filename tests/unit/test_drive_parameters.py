@@ -114,7 +114,7 @@ def test_saved_parameters_are_there_after_resets_and_power_cycles(bench: Storing
     assert values(bench) == CHANGED
     bench.power_cycle()
     assert values(bench) == CHANGED
-    assert bench.drive.gains[0] == 1234  # not in the dictionary alone
+    assert bench.drive.axis.gains[0] == 1234  # not in the dictionary alone
     assert bench.run(250 * MS) == ["705#7F"]
     bench.drive.switch_off(bench.now_ns)
     bench.drive.switch_on(bench.now_ns)

@@ -168,7 +168,7 @@ def test_actual_values_are_taken_before_new_demands_act(bench: Bench):
     bench.set_point(0x06, 0)
     assert bench.sync() == ["185#5002000000000000"]  # still switch on disabled
     assert bench.sync() == ["185#3102000000000000"]  # ready to switch on
-    bench.drive.latch = lambda now_ns: (now_ns // MS, -1.0, -7)
+    bench.drive.axis.latch = lambda now_ns: (now_ns // MS, -1.0, -7)
     bench.now_ns = 0x123 * MS
     assert bench.sync() == ["185#310223010000F9FF"]
 
@@ -248,7 +248,7 @@ def test_type_zero_sends_at_the_sync_after_a_change(bench: Bench):
     bench.nmt(0x01)
     assert bench.sync() == ["185#500200000000"]
     assert bench.sync() == []
-    bench.drive.latch = lambda now_ns: (5, 0.0, 0)
+    bench.drive.axis.latch = lambda now_ns: (5, 0.0, 0)
     bench.tick()
     assert bench.sync() == []  # a measured value that moves is no event
     bench.control(0x06)
@@ -322,7 +322,7 @@ def test_extreme_actual_values_do_not_break_the_frame(bench: Bench):
     bench.map_tpdo(1, 0x185, 1, [0x60640020, 0x606C0020])
     bench.map_tpdo(2, 0x285, 1, [0x60770010, 0x60F40020])
     bench.nmt(0x01)
-    bench.drive.latch = lambda now_ns: ((1 << 31) + 2, 1e12, 100_000)
+    bench.drive.axis.latch = lambda now_ns: ((1 << 31) + 2, 1e12, 100_000)
     assert bench.sync() == ["185#02000080FFFFFF7F", "285#FF7F00000000"]
 
 
@@ -330,9 +330,9 @@ def test_settings_show_in_the_dictionary():
     bench = Bench(DriveSettings(counts_per_revolution=8192, rated_torque_Nm=2.25, gains=(1, 2, 3, 4, 5)))
     assert bench.read(0x608F, 1) == 8192
     assert bench.read(0x6076) == 2250
-    assert bench.drive.gains == (1, 2, 3, 4, 5)
+    assert bench.drive.axis.gains == (1, 2, 3, 4, 5)
     bench.must(0x3020, 4, -9, 4)
-    assert bench.drive.gains == (1, 2, 3, -9, 5)
+    assert bench.drive.axis.gains == (1, 2, 3, -9, 5)
 
 
 def test_settings_are_checked():

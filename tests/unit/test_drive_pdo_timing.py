@@ -203,7 +203,7 @@ def test_type_253_answers_with_the_values_of_the_moment(bench: Bench):
     bench.nmt(0x01)
     assert bench.sync() == []
     assert bench.run(100 * MS) == []
-    bench.drive.latch = lambda now_ns: (now_ns // MS, 0.0, 0)
+    bench.drive.axis.latch = lambda now_ns: (now_ns // MS, 0.0, 0)
     bench.now_ns = 0x321 * MS
     assert request(bench, 0x185) == ["185#21030000"]
     bench.now_ns = 0x322 * MS
@@ -214,7 +214,7 @@ def test_type_252_answers_with_the_sample_of_the_last_sync(bench: Bench):
     bench.map_tpdo(1, 0x185, 252, [0x60640020])
     bench.nmt(0x01)
     assert request(bench, 0x185) == []
-    bench.drive.latch = lambda now_ns: (now_ns // MS, 0.0, 0)
+    bench.drive.axis.latch = lambda now_ns: (now_ns // MS, 0.0, 0)
     bench.now_ns = 0x321 * MS
     assert bench.sync() == []
     bench.now_ns = 0x322 * MS

@@ -24,7 +24,7 @@ def started(mode: int, *writes: tuple[int, int, int, int], settings: DriveSettin
 
 
 def show(bench: Bench, velocity: float, torque: int = 0) -> None:
-    bench.drive.latch = lambda now_ns: (bench.shaft, velocity, torque)
+    bench.drive.axis.latch = lambda now_ns: (bench.shaft, velocity, torque)
 
 
 # -- profile velocity ------------------------------------------------------------------------------------------------
@@ -181,14 +181,14 @@ def test_csv_to_csp_comes_to_rest_and_holds():
 def test_cst_holds_then_takes_the_torque_with_its_offset():
     bench = cyclic(10, 0x60710010, (0x6071, 0, 900, 2))
     bench.run(10 * MS)
-    assert bench.drive.torque_demand_Nm is None  # the position is held
+    assert bench.drive.axis.torque_demand_Nm is None  # the position is held
     bench.must(0x60B2, 0, -50, 2)
     cycle(bench, "h", 250)
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.2 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.2 * 1.5)
     bench.follows = False
     bench.shaft = 400
     cycle(bench, "h", 4_000)
-    assert bench.drive.torque_demand_Nm == pytest.approx(3.0 * 1.5)  # max torque 6072h
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(3.0 * 1.5)  # max torque 6072h
     assert bench.drive.position_demand_counts == 400.0
     assert bench.read(0x60F4) == 0
 
@@ -199,7 +199,7 @@ def test_cst_holds_then_takes_the_torque_with_its_offset():
     show(bench, 10_000.0)
     cycle(bench, "h", 100)
     bench.control(0x02)
-    assert bench.drive.torque_demand_Nm is None
+    assert bench.drive.axis.torque_demand_Nm is None
     bench.run(150 * MS)
     assert bench.drive.power_state is PowerState.SWITCH_ON_DISABLED
     bench = cyclic(10, 0x60710010, (0x6084, 0, 100_000, 4))
@@ -221,20 +221,20 @@ def test_tq_starts_from_the_actual_torque_and_keeps_to_the_slope():
     bench.must(0x6071, 0, 200, 2)
     bench.must(0x6060, 0, 4, 1)
     bench.tick()
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.1 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.1 * 1.5)
     bench.tick()
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.11 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.11 * 1.5)
     assert bench.read(0x6074) == 110
     assert bench.statusword & REACHED == 0
     bench.run(9 * MS)
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.2 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.2 * 1.5)
     assert bench.statusword & REACHED
     bench.control(0x10F)
     bench.run(20 * MS)
-    assert bench.drive.torque_demand_Nm == 0.0
+    assert bench.drive.axis.torque_demand_Nm == 0.0
     bench.control(0x0F)
     bench.run(5 * MS)
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.05 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.05 * 1.5)
 
 
 # -- csp with its offset ----------------------------------------------------------------------------------------------
@@ -260,15 +260,15 @@ def test_csp_does_not_run_over_a_software_limit():
 
 def test_the_least_of_max_torque_and_the_limit_of_the_direction_counts():
     bench = cyclic(10, 0x60710010, (0x6072, 0, 800, 2), (0x60E0, 0, 500, 2), (0x60E1, 0, 900, 2))
-    assert bench.drive.torque_limit_Nm == pytest.approx(0.5 * 1.5)
-    assert bench.drive.negative_torque_limit_Nm == pytest.approx(0.8 * 1.5)
+    assert bench.drive.axis.torque_limit_Nm == pytest.approx(0.5 * 1.5)
+    assert bench.drive.axis.negative_torque_limit_Nm == pytest.approx(0.8 * 1.5)
     cycle(bench, "h", 1_000)
-    assert bench.drive.torque_demand_Nm == pytest.approx(0.5 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(0.5 * 1.5)
     cycle(bench, "h", -1_000)
-    assert bench.drive.torque_demand_Nm == pytest.approx(-0.8 * 1.5)
+    assert bench.drive.axis.torque_demand_Nm == pytest.approx(-0.8 * 1.5)
     bench.nmt(0x81)
     bench.wake()
-    assert bench.drive.torque_limit_Nm == pytest.approx(3.0 * 1.5)
+    assert bench.drive.axis.torque_limit_Nm == pytest.approx(3.0 * 1.5)
 
 
 def test_the_servo_loop_is_limited_in_each_direction():

@@ -76,7 +76,7 @@ def test_settings_are_of_every_drive() -> None:
     machine = free_machine([3, 4], settings=DriveSettings(counts_per_revolution=65536, gains=(1, 2, 3, 4, 5)))
     for drive in machine.drives:
         assert isinstance(drive, Drive)
-        assert drive.gains == (1, 2, 3, 4, 5)
+        assert drive.axis.gains == (1, 2, 3, 4, 5)
         assert drive.dictionary.read(0x608F, 1, 0) == bytes((0, 0, 1, 0))
     assert [axis.counts_per_revolution for axis in machine.axes] == [65536, 65536]
 

@@ -54,7 +54,8 @@ class FakeDrive:
         self.torque_limit_Nm = 4.5
         self.negative_torque_limit_Nm = 4.5
         self.is_powered = False
-        self.brake_released = False
+        self.is_brake_released = False
+        self.axes = (self,)
         self.gains: tuple[int, ...] = (4000, 0, 0, 45_000, 45_000)
         self.demand: Callable[[int], float] = lambda now_ns: 0.0
         self.answers: dict[int, list[Frame]] = {}
@@ -64,7 +65,7 @@ class FakeDrive:
 
     def power(self, on: bool = True) -> None:
         self.is_powered = on
-        self.brake_released = on
+        self.is_brake_released = on
 
     def cob_ids(self) -> set[int]:
         return self.listens
@@ -81,8 +82,11 @@ class FakeDrive:
         if not self.keeps_waking:
             self.wakes_ns = [at_ns for at_ns in self.wakes_ns if at_ns > now_ns]
 
-    def on_servo_tick(self, now_ns: int, shaft_counts: int, velocity_counts_per_s: float) -> None:
-        self.log.append(("tick", self.name, now_ns, shaft_counts, velocity_counts_per_s))
+    def after_servo_tick(self, now_ns: int) -> None:
+        pass
+
+    def on_tick(self, now_ns: int, shaft_counts: int) -> None:
+        self.log.append(("tick", self.name, now_ns, shaft_counts, self.latch(now_ns)[1]))
         self.position_demand_counts = self.demand(now_ns)
 
     def trip(self, error_code: int, error_register_bits: int, now_ns: int, *, persists: bool = False) -> None:
@@ -296,7 +300,7 @@ def test_events_of_drives_are_collected() -> None:
 
 def test_resolver_is_quantised_and_its_velocity_is_a_one_sample_difference() -> None:
     bench = Bench(1, axes=[FreeAxisParameters(0.001, load_torque_Nm=-1.0)])
-    bench.drives[0].brake_released = True
+    bench.drives[0].is_brake_released = True
     bench.run_until(20 * MS)
     seen = [entry[3:] for entry in bench.log if entry[0] == "tick"]
     # The brake is released at the first tick; from there 1000 rad/s2: theta = 500 t^2, t = n / 1024 s.
@@ -309,7 +313,7 @@ def test_resolver_is_quantised_and_its_velocity_is_a_one_sample_difference() -> 
 def test_latch_extrapolates_between_ticks() -> None:
     bench = Bench(1, axes=[FreeAxisParameters(0.001, load_torque_Nm=-1.0)])
     drive = bench.drives[0]
-    drive.brake_released = True
+    drive.is_brake_released = True
     bench.run_until(101 * 1_953_125 // 2)
     tick_ns = 101 * 1_953_125 // 2
 
@@ -354,7 +358,7 @@ def test_an_axis_without_power_gets_no_torque_and_starts_anew() -> None:
     bench = Bench(1)
     drive = bench.drives[0]
     drive.demand = lambda now_ns: 1000.0
-    drive.brake_released = True
+    drive.is_brake_released = True
     bench.run_until(10 * MS)
     assert bench.plant.angle(0) == 0.0
     drive.power()
@@ -378,7 +382,7 @@ def test_brakes_hold_the_five_bar_until_they_are_released() -> None:
     bench = Bench(five_bar=True)
     bench.run_until(3 * SECOND)
     assert (bench.plant.angle(0), bench.plant.angle(1)) == (0.0, 0.0)
-    bench.drives[0].brake_released = True
+    bench.drives[0].is_brake_released = True
     bench.run_until(3 * SECOND + 30 * MS)
     assert bench.plant.angle(0) < -0.01
     assert bench.plant.angle(1) == 0.0
@@ -429,7 +433,7 @@ def test_records_keep_the_last_ticks() -> None:
 
 def test_numbers_of_drives_and_axes_must_agree() -> None:
     plant = FreeAxisPlant([FreeAxisParameters(1.0)], [0.0])
-    with pytest.raises(ValueError, match="0 drives and 1 axes for a plant of 1 axes"):
+    with pytest.raises(ValueError, match="drives of 0 axes and 1 scalings of axes for a plant of 1 axes"):
         EmulatedMachine([], plant, [MachineAxis()])
     with pytest.raises(ValueError, match="rated_torque_Nm"):
         MachineAxis(rated_torque_Nm=0.0)
