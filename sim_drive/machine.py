@@ -37,13 +37,10 @@ Latch = Callable[[int], tuple[int, float, int]]
 class DriveAxis(Protocol):
     """What the machine needs of one axis of a drive; `sim_drive.axis` has the real one."""
 
-    @property
-    def latch(self) -> Latch:
-        """Set by the machine: what the axis' resolver and amplifier show at an instant."""
+    def measure_by(self, latch: Latch) -> None:
+        """Take from ``latch`` what the axis' resolver and amplifier show at an instant."""
         ...
 
-    @latch.setter
-    def latch(self, latch: Latch) -> None: ...
     @property
     def position_demand_counts(self) -> float: ...
     @property
@@ -351,7 +348,7 @@ class EmulatedMachine:
         self._routes: dict[int, tuple[_Station, ...]] = {}
         for motor in self._motors:
             motor.counts = motor.quantise(plant.angle(motor.index))
-            motor.drive_axis.latch = self._latch_of(motor)
+            motor.drive_axis.measure_by(self._latch_of(motor))
         for station in self._stations:
             self._ask_wake(station)
         self._read_subscriptions()

@@ -86,7 +86,6 @@ class Motion(ABC):
         self.settings: Final = settings
         self.demand: Final = Demand()
         self.latch: Latch = self._last_tick
-        """The machine puts the plant's here."""
         self.source = SetPointSource.SDO
         """Set by whoever writes into the dictionary, around the writing."""
         self.shaft_counts = 0
@@ -122,6 +121,10 @@ class Motion(ABC):
     def entry(self, index: int, subindex: int = 0) -> Entry:
         """The entry of an object of the axis, by its index in the first axis."""
         return self.dictionary.entry(of_axis(index, self.number), subindex)
+
+    def measure_by(self, latch: Latch) -> None:
+        """Take actual values from ``latch``, rather than from the last servo tick."""
+        self.latch = latch
 
     def _last_tick(self, now_ns: int) -> tuple[int, float, int]:
         return self.shaft_counts, 0.0, 0

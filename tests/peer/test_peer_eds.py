@@ -16,6 +16,7 @@ from canopen.objectdictionary import ODVariable
 
 from drivers.eds import load_eds
 from drivers.object_dictionary import DataType
+from sim_drive.logical_axes import eds_of_axes
 
 EDS = Path(__file__).resolve().parent.parent.parent / "config" / "eds" / "sim_drive.eds"
 PATIENCE_S = 60.0
@@ -37,7 +38,7 @@ def test_dcfchk_has_nothing_to_say(node_id: int) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        ("AccessType=ro\nDefaultValue=0x00020192", "AccessType=r\nDefaultValue=0x00020192"),
+        ("[1000]\nParameterName=Device type\nObjectType=0x7", "[1000]\nParameterName=Device type\nObjectType=0x6"),
         ("SupportedObjects=3\n", "SupportedObjects=4\n"),
         ("LowLimit=-6\nHighLimit=-1\nDefaultValue=-3", "LowLimit=-6\nHighLimit=-4\nDefaultValue=-3"),
     ],
@@ -49,6 +50,14 @@ def test_dcfchk_would_find_a_mistake(tmp_path: Path, before: str, after: str) ->
     broken.write_text(text.replace(before, after))
     done = dcfchk(broken, 1)
     assert done.returncode != 0 or done.stderr
+
+
+@pytest.mark.parametrize("axes", [2, 8])
+def test_dcfchk_has_nothing_to_say_about_several_axes(tmp_path: Path, axes: int) -> None:
+    written = tmp_path / "axes.eds"
+    written.write_text(eds_of_axes(EDS.read_text(), axes))
+    done = dcfchk(written, 5)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 @pytest.mark.parametrize("node_id", [1, 2, 127])

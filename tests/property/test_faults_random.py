@@ -20,6 +20,7 @@ NODES = (5, 9)
 END_S = 1.0
 PARAMETERS: dict[str, st.SearchStrategy[Any]] = {
     "error_code": st.integers(1, 0xFFFF),
+    "axis": st.just(1),
     "counts": st.integers(-10_000, 10_000).filter(bool),
     "delay_s": st.floats(1e-6, 0.2),
     "index": st.sampled_from([0x1000, 0x1017, 0x1800, 0x6040, 0x6060]),

@@ -67,6 +67,9 @@ class FakeDrive:
         self.is_powered = on
         self.is_brake_released = on
 
+    def measure_by(self, latch: Latch) -> None:
+        self.latch = latch
+
     def cob_ids(self) -> set[int]:
         return self.listens
 
