@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 import typer
 
-from config.loading import ConfigError, load_config
+from config.loading import SHIPPED, ConfigError, load_config
 from config.quirks import Quirk
 from config.schema import BusSection, GatewayConfig
+from drivers.eds import read_eds_text
 from drivers.errors import BusError, DriveError
 from drivers.nmt import MAX_NODE_ID
 from drivers.node import Event, Node
@@ -25,6 +26,7 @@ from drivers.ports import interface_is_up, open_port
 from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
 from mechanism.errors import MechanismError
 from sim_drive.faults import Fault, describe_faults
+from sim_drive.logical_axes import MAX_AXES, eds_of_axes
 from sim_drive.quirks import describe_quirks
 from sim_drive.scenario import Scenario, load_scenario, parse_fault
 from sim_drive.settings import DriveSettings
@@ -46,6 +48,9 @@ _EPILOG: Final = """Examples:
   sim-drive paper --interface socketcan --channel vcan1
   sim-drive paper --duration 60 --ready-file /tmp/ready.json
   sim-drive --nodes 1-20,30                  no machine: drives on free axes, at most 127
+  sim-drive --nodes 5 --axes-per-node 2      a two-axis drive: its second axis has its objects at 6800h, PDOs from 65 on
+  sim-drive paper --axes-per-node 2          the machine's two axes in one node, that of the first
+  sim-drive --nodes 5 --axes-per-node 2 --write-eds two.eds    the EDS file of such a node, and exit
   sim-drive paper --fault "servo over_current at_s=3" --fault "1 lost_frames cob_id=0x181 probability=0.01"
   sim-drive paper --scenario trouble.yaml    the same in a file, faults: [{node: servo, kind: over_current, at_s: 3}]
   sim-drive --list-faults                    every kind of fault, and what it takes
@@ -112,6 +117,19 @@ class _Fleet:
     """None: drives on free axes."""
     names: dict[str, int] = field(default_factory=dict[str, int])
     """Node ids by the names of their axes."""
+    axes_per_node: int = 1
+
+    @property
+    def axes(self) -> dict[str, int] | None:
+        """Numbers of the axes by their names, where they share a node."""
+        return {name: place for place, name in enumerate(self.names, start=1)} if self.axes_per_node > 1 else None
+
+    @property
+    def eds(self) -> Path:
+        """The EDS file of drives of one axis."""
+        if self.config is None:
+            return SHIPPED / "eds" / "sim_drive.eds"
+        return self.config.relative(self.config.emulator.eds)
 
 
 def _print_quirks(wanted: bool) -> None:
@@ -133,6 +151,12 @@ def sim_drive(
     ] = None,
     nodes: Annotated[
         str | None, typer.Option(help="In place of CONFIG: node ids of drives on free axes, such as 1-20,30.")
+    ] = None,
+    axes_per_node: Annotated[
+        int, typer.Option(min=1, max=MAX_AXES, help="Logical axes in each node; with CONFIG 1, or all in one.")
+    ] = 1,
+    write_eds: Annotated[
+        Path | None, typer.Option(help="Write the EDS file of the drives to this file, and exit.")
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="File that says which faults there are, and when.")] = None,
     fault: Annotated[
@@ -180,7 +204,10 @@ def sim_drive(
     """Emulate the drives of a machine, and the machine that they move, on a CAN bus."""
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, format="sim-drive: %(message)s")
     stop = _stop_on_signals()
-    fleet = _fleet(config, nodes)
+    fleet = _fleet(config, nodes, axes_per_node)
+    if write_eds is not None:
+        write_eds.write_text(eds_of_axes(read_eds_text(fleet.eds), axes_per_node), encoding="utf-8")
+        return
     trouble = _scenario(scenario, fault or [], fleet)
     bus_section = BusSection() if fleet.config is None else fleet.config.bus
     place = _place(bus_section, interface, channel, host, port)
@@ -234,16 +261,22 @@ def main() -> NoReturn:
     sys.exit(status)
 
 
-def _fleet(config: str | None, nodes: str | None) -> _Fleet:
+def _fleet(config: str | None, nodes: str | None, axes_per_node: int) -> _Fleet:
     """The drives that the command line asks for. Raises ConfigError."""
     if (config is None) == (nodes is None):
         raise ConfigError(["give either CONFIG or --nodes" + (", not both" if config is not None else "")])
     if nodes is not None:
         node_ids = parse_node_ids(nodes)
-        return _Fleet(f"a row of {len(node_ids)} free axes", node_ids)
+        name = f"a row of {len(node_ids) * axes_per_node} free axes"
+        return _Fleet(name, node_ids, axes_per_node=axes_per_node)
     settings = load_config(config or "")
     names = {name: settings.axes[name].node_id for name in settings.axis_names}
-    return _Fleet(settings.name, tuple(names.values()), settings, names)
+    if axes_per_node == 1:
+        return _Fleet(settings.name, tuple(names.values()), settings, names)
+    if axes_per_node != len(names):
+        raise ConfigError([f"--axes-per-node {axes_per_node}: a machine of {len(names)} axes takes 1 or {len(names)}"])
+    first = next(iter(names.values()))
+    return _Fleet(settings.name, (first,), settings, dict.fromkeys(names, first), axes_per_node)
 
 
 def parse_node_ids(text: str) -> tuple[int, ...]:
@@ -269,24 +302,29 @@ def parse_node_ids(text: str) -> tuple[int, ...]:
 
 def _scenario(file: Path | None, words: Sequence[str], fleet: _Fleet) -> Scenario:
     """All faults that the command line asks for. Raises ConfigError."""
-    scenario = Scenario() if file is None else load_scenario(file, fleet.names, fleet.node_ids)
+    scenario = Scenario() if file is None else load_scenario(file, fleet.names, fleet.node_ids, fleet.axes)
     further: list[Fault] = []
     for text in words:
-        further += parse_fault(text, fleet.names, fleet.node_ids)
+        further += parse_fault(text, fleet.names, fleet.node_ids, fleet.axes)
     return Scenario((*scenario.faults, *further), scenario.seed, scenario.name)
 
 
 def _build(fleet: _Fleet, quirks: frozenset[Quirk], scenario: Scenario, seed: int) -> "EmulatedMachine | Injector":
     # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
-    from sim_drive.assembly import FREE_AXIS_GAINS, build_machine, free_machine
+    from sim_drive.assembly import FREE_AXIS_GAINS, build_machine, free_machine, settings_of_axes
     from sim_drive.injector import Injector
 
     if fleet.config is None:
-        settings = DriveSettings(gains=FREE_AXIS_GAINS, quirks=quirks)
+        settings = settings_of_axes(DriveSettings(gains=FREE_AXIS_GAINS, quirks=quirks), fleet.axes_per_node)
         machine = free_machine(fleet.node_ids, settings=settings, seed=seed)
     else:
-        machine = build_machine(_with_quirks(fleet.config, quirks), seed)
-    return Injector(machine, scenario.faults, scenario.seed ^ seed) if scenario.faults else machine
+        machine = build_machine(_with_quirks(fleet.config, quirks), seed, in_one_node=fleet.axes_per_node > 1)
+    if not scenario.faults:
+        return machine
+    try:
+        return Injector(machine, scenario.faults, scenario.seed ^ seed)
+    except ValueError as error:
+        raise ConfigError([str(error)]) from None
 
 
 def _with_quirks(config: GatewayConfig, quirks: frozenset[Quirk]) -> GatewayConfig:

@@ -10,7 +10,7 @@ from pydantic import Field, ValidationError
 
 from config.loading import ConfigError, parse_model, read_text, sentence
 from config.schema import Model
-from sim_drive.faults import PARAMETERS, Direction, Fault, FaultKind
+from sim_drive.faults import FAULTS, PARAMETERS, Direction, Fault, FaultKind
 
 MAX_FAULTS: Final = 10_000
 ALL_NODES: Final = "all"
@@ -55,9 +55,13 @@ class FaultSection(Model):
     revision_number: _Whole | None = None
     serial_number: _Whole | None = None
 
-    def resolve(self, nodes: Mapping[str, int], node_ids: Sequence[int]) -> list[Fault]:
+    def resolve(
+        self, nodes: Mapping[str, int], node_ids: Sequence[int], axes: Mapping[str, int] | None = None
+    ) -> list[Fault]:
         """The faults that this says, one a node; raises ValueError with a sentence."""
         parameters: dict[str, Any] = {key: getattr(self, key) for key in PARAMETERS}
+        if axes and isinstance(self.node, str) and "axis" in FAULTS[self.kind].optional and self.axis is None:
+            parameters["axis"] = axes.get(self.node)
         return [
             Fault(self.kind, node_id, self.at_s, self.for_s, **parameters)
             for node_id in self._node_ids(nodes, node_ids)
@@ -82,19 +86,30 @@ class ScenarioSection(Model):
     faults: Annotated[list[FaultSection], Field(max_length=MAX_FAULTS)]
 
 
-def load_scenario(path: Path, nodes: Mapping[str, int], node_ids: Sequence[int]) -> Scenario:
-    """The scenario in a file; ``nodes`` are the axes' names with their node ids. Raises config.loading.ConfigError."""
-    return parse_scenario(read_text(path), path, nodes, node_ids)
+def load_scenario(
+    path: Path, nodes: Mapping[str, int], node_ids: Sequence[int], axes: Mapping[str, int] | None = None
+) -> Scenario:
+    """The scenario in a file; ``nodes`` are the axes' names with their node ids. Raises config.loading.ConfigError.
+
+    ``axes``: where axes share a node, their names with their numbers in it.
+    """
+    return parse_scenario(read_text(path), path, nodes, node_ids, axes)
 
 
-def parse_scenario(text: str, path: Path, nodes: Mapping[str, int], node_ids: Sequence[int]) -> Scenario:
+def parse_scenario(
+    text: str,
+    path: Path,
+    nodes: Mapping[str, int],
+    node_ids: Sequence[int],
+    axes: Mapping[str, int] | None = None,
+) -> Scenario:
     """The scenario that ``text`` says; ``path`` is where it came from. Raises config.loading.ConfigError."""
     section = parse_model(text, path, ScenarioSection)
     faults: list[Fault] = []
     problems: list[str] = []
     for place, fault in enumerate(section.faults):
         try:
-            faults += fault.resolve(nodes, node_ids)
+            faults += fault.resolve(nodes, node_ids, axes)
         except ValueError as error:
             problems.append(f"{path}: faults.{place}.{error}")
     if problems:
@@ -102,7 +117,9 @@ def parse_scenario(text: str, path: Path, nodes: Mapping[str, int], node_ids: Se
     return Scenario(tuple(faults), section.seed, section.name)
 
 
-def parse_fault(text: str, nodes: Mapping[str, int], node_ids: Sequence[int]) -> list[Fault]:
+def parse_fault(
+    text: str, nodes: Mapping[str, int], node_ids: Sequence[int], axes: Mapping[str, int] | None = None
+) -> list[Fault]:
     """The faults that one line says: ``NODE KIND [KEY=VALUE]...``, with the keys of a scenario file.
 
     For example ``servo over_current at_s=3 for_s=1``. Raises config.loading.ConfigError.
@@ -119,7 +136,7 @@ def parse_fault(text: str, nodes: Mapping[str, int], node_ids: Sequence[int]) ->
             raise ConfigError([f"fault '{text}': {key} is given twice"])
         document[key] = _value(value)
     try:
-        return FaultSection.model_validate(document).resolve(nodes, node_ids)
+        return FaultSection.model_validate(document).resolve(nodes, node_ids, axes)
     except ValidationError as error:
         raise ConfigError(
             [f"fault '{text}': {sentence(details, FaultSection)}" for details in error.errors()]

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from config.loading import load_config
+from drivers.eds import load_eds
 from drivers.frame import Frame
 from drivers.ports import open_port
 
@@ -91,3 +92,26 @@ def test_the_machine_is_served_until_it_is_told_to_stop(tmp_path: Path) -> None:
     assert lines[0] == {"event": "ready", **place}
     assert lines[1]["frames_received"] == 1
     assert "Traceback" not in err
+
+
+def test_the_eds_of_a_two_axis_drive_is_written(tmp_path: Path) -> None:
+    file = tmp_path / "two.eds"
+    done = run("--nodes", "5", "--axes-per-node", "2", "--write-eds", str(file))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    described = load_eds(file, 5)
+    assert described.get(0x6840, 0) is not None
+    assert described.get(0x7040, 0) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("paper", "--axes-per-node", "3"), "--axes-per-node 3: a machine of 2 axes takes 1 or 2"),
+        (("paper", "--axes-per-node", "2", "--fault", "servo over_current axis=3"), "axis 3: node 1 has 2 axes"),
+    ],
+)
+def test_axes_that_there_are_not_are_refused(arguments: tuple[str, ...], sentence: str) -> None:
+    done = run(*arguments, "--interface", "socketcand", "--port", "0", "--duration", "0")
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1

@@ -117,3 +117,15 @@ def test_a_wrong_fault_in_words_is_refused_in_one_sentence(text: str, sentence: 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: cannot be read \(No such file or directory\)"):
         load_scenario(tmp_path / "none.yaml", NODES, IDS)
+
+
+def test_axes_that_share_a_node_are_told_apart_by_their_names() -> None:
+    names, numbers = {"cv": 1, "servo": 1}, {"cv": 1, "servo": 2}
+    (fault,) = parse_fault("servo over_current at_s=1", names, [1], numbers)
+    assert (fault.node_id, fault.axis) == (1, 2)
+    (fault,) = parse_fault("servo over_current axis=1", names, [1], numbers)
+    assert fault.axis == 1
+    (fault,) = parse_fault("1 over_current", names, [1], numbers)
+    assert fault.axis is None
+    (fault,) = parse_fault("servo mute_heartbeat", names, [1], numbers)
+    assert fault.axis is None

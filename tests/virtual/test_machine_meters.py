@@ -30,7 +30,7 @@ def test_an_eccentric_resolver_errs_once_a_revolution() -> None:
     axis = MachineAxis(resolver_eccentricity_counts=12.0, resolver_eccentricity_rad=0.5)
     bench = Bench(1, axes=[FreeAxisParameters(0.001, load_torque_Nm=-1.0)], axis=axis)
     drive = bench.drives[0]
-    drive.brake_released = True
+    drive.is_brake_released = True
     bench.run_until(180 * MS)
     seen = [int(str(entry[3])) for entry in bench.log if entry[0] == "tick"]
     for n, counts in enumerate(seen):
