@@ -43,7 +43,7 @@ def test_an_eccentric_resolver_errs_once_a_revolution() -> None:
     periods = 100.5
     at_ns = round((1 + periods) * 1e9 / 1024)
     bench = Bench(1, axes=[FreeAxisParameters(0.001, load_torque_Nm=-1.0)], axis=axis)
-    bench.drives[0].brake_released = True
+    bench.drives[0].is_brake_released = True
     bench.run_until(at_ns)
     angle = 500.0 * (periods / 1024) ** 2
     assert bench.drives[0].latch(at_ns)[0] == floor(angle * COUNTS_PER_RAD + 12.0 * sin(angle - 0.5) + 0.5)
