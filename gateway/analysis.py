@@ -12,16 +12,17 @@ was missed hold an old actual value: they are counted, and left out of its figur
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.histograms import CycleCounts, CycleHistograms, Timing, count_cycles
 from gateway.paper_reference import TABLE_II, PrecisionPoint, is_reference_machine
 from gateway.recording import CAM_ATTACHMENT, Recording, RecordingError
 from gateway.run_constants import RunConstants
-from gateway.sample import MISSED_TPDO_MASK, Phase, SampleArray, SampleFlag
+from gateway.sample import MISSED_TPDO_MASK, Phase, SampleArray
 from mechanism.cam_file import parse_cam_file
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import CamFileError
@@ -120,10 +121,7 @@ class CycleFigures:
 
     period_s: float
     count: int
-    missed_tpdo: int
-    """TPDOs that did not come in time, all axes together."""
-    missed_rpdo_deadline: int
-    overruns: int
+    counts: CycleCounts
     lost_samples: int
     """Cycles that are missing in the record, by their numbers."""
     sync_period_deviation_us: Distribution
@@ -137,6 +135,7 @@ class CycleFigures:
     """Last RPDO before the next SYNC was due."""
     loop_cpu_us_per_cycle: float | None
     """Mean; None where nobody measured it, as in virtual time."""
+    histograms: CycleHistograms
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,7 +359,8 @@ def cycle_figures(data: RunData) -> CycleFigures:
     """The timing of the cycle over every sample."""
     samples = data.samples
     flags = samples["flags"]
-    missed = sum(int(np.count_nonzero(flags & (1 << axis))) for axis in range(len(data.constants.axes)))
+    histograms = CycleHistograms()
+    histograms.add(samples)
     # The first SYNC has none before it; across a hole in the record the period says nothing.
     has_period = samples["sync_period_ns"] > 0
     period_ns = data.constants.period_s * 1e9
@@ -369,9 +369,7 @@ def cycle_figures(data: RunData) -> CycleFigures:
     return CycleFigures(
         period_s=data.constants.period_s,
         count=len(samples),
-        missed_tpdo=missed,
-        missed_rpdo_deadline=int(np.count_nonzero(flags & SampleFlag.MISSED_RPDO_DEADLINE)),
-        overruns=int(np.count_nonzero(flags & SampleFlag.OVERRUN)),
+        counts=count_cycles(samples, len(data.constants.axes)),
         lost_samples=max(0, span - len(samples)),
         sync_period_deviation_us=_distribution(np.abs(samples["sync_period_ns"][has_period] - period_ns)),
         sync_deviation_us=_distribution(np.abs(samples["sync_deviation_ns"].astype(np.float64))),
@@ -379,6 +377,7 @@ def cycle_figures(data: RunData) -> CycleFigures:
         tpdo_arrival_us=_distribution(samples["tpdo_arrival_ns"][(flags & MISSED_TPDO_MASK) == 0].astype(np.float64)),
         rpdo_lead_us=_extremes(samples["rpdo_lead_ns"] / 1e3),
         loop_cpu_us_per_cycle=float(samples["loop_cpu_ns"].mean()) / 1e3 if samples["loop_cpu_ns"].any() else None,
+        histograms=histograms,
     )
 
 
@@ -502,9 +501,7 @@ def _cycle_json(cycle: CycleFigures) -> dict[str, Any]:
     return {
         "period_s": cycle.period_s,
         "count": cycle.count,
-        "missed_tpdo": cycle.missed_tpdo,
-        "missed_rpdo_deadline": cycle.missed_rpdo_deadline,
-        "overruns": cycle.overruns,
+        **asdict(cycle.counts),
         "lost_samples": cycle.lost_samples,
         "sync_period_deviation_us": _table(cycle.sync_period_deviation_us),
         "sync_deviation_us": _table(cycle.sync_deviation_us),
@@ -512,6 +509,8 @@ def _cycle_json(cycle: CycleFigures) -> dict[str, Any]:
         "tpdo_arrival_us": _table(cycle.tpdo_arrival_us),
         "rpdo_lead_us": _table(cycle.rpdo_lead_us),
         "loop_cpu_us_per_cycle": _rounded(cycle.loop_cpu_us_per_cycle),
+        "spread_us": {timing.value: asdict(cycle.histograms.spread(timing)) for timing in Timing},
+        "hdr_histograms_ns": {timing.value: cycle.histograms.encoded(timing) for timing in Timing},
     }
 
 

@@ -20,10 +20,11 @@ from rich.text import Text
 
 from drivers.cia402 import State, state_of
 from gateway.errors import GatewayError
+from gateway.histograms import CycleCounts, CycleHistograms, Spread, Timing, count_cycles
 from gateway.report_text import number
 from gateway.ring import RingReader, RunState, find_rings
 from gateway.run_constants import RunConstants
-from gateway.sample import Phase, SampleArray, SampleFlag
+from gateway.sample import Phase, SampleArray
 
 REFRESH_S: Final = 0.1
 JSON_INTERVAL_S: Final = 1.0
@@ -77,10 +78,10 @@ class MonitorView:
     """|period - cycle|: p50, p99, max over the window."""
     wake_lateness_us: tuple[float, float, float]
     loop_cpu_us: float
-    missed_tpdo: int
-    """In what this monitor has seen, like the other counts: from the oldest sample in the ring on."""
-    missed_rpdo_deadline: int
-    overruns: int
+    counts: CycleCounts
+    """In what this monitor has seen: from the oldest sample in the ring on."""
+    spreads: dict[Timing, Spread]
+    """Of the same."""
     lost_samples: int
     """That this monitor was too slow for; the recorder has its own reader."""
     events: tuple[str, ...]
@@ -92,6 +93,8 @@ class MonitorView:
         view["axes"] = {axis.name: {k: v for k, v in asdict(axis).items() if k != "name"} for axis in self.axes}
         for key in ("sync_period_deviation_us", "wake_lateness_us"):
             view[key] = dict(zip(("p50", "p99", "max"), view[key], strict=True))
+        view |= view.pop("counts")
+        view["spread_us"] = {timing.value: spread for timing, spread in view.pop("spreads").items()}
         return view
 
 
@@ -102,9 +105,8 @@ class Monitor:
         self._reader = reader
         self._constants = reader.constants
         self._window: SampleArray = np.empty(0, dtype=reader.layout.dtype)
-        self._missed_tpdo = 0
-        self._missed_deadline = 0
-        self._overruns = 0
+        self._counts = CycleCounts()
+        self._histograms = CycleHistograms()
         self._lost = 0
         self._is_attached = False
         self._start_ns: int | None = None
@@ -116,10 +118,8 @@ class Monitor:
         # What the ring had already overwritten when this monitor came is nobody's loss.
         self._lost += lost if self._is_attached else 0
         self._is_attached = True
-        flags = samples["flags"]
-        self._missed_tpdo += sum(int(np.count_nonzero(flags & (1 << i))) for i in range(len(self._constants.axes)))
-        self._missed_deadline += int(np.count_nonzero(flags & SampleFlag.MISSED_RPDO_DEADLINE))
-        self._overruns += int(np.count_nonzero(flags & SampleFlag.OVERRUN))
+        self._counts += count_cycles(samples, len(self._constants.axes))
+        self._histograms.add(samples)
         self._window = last_cycle(np.concatenate((self._window, samples))[-_MAX_WINDOW:])
         events, _ = self._reader.read_new_events()
         for event in events:
@@ -149,9 +149,8 @@ class Monitor:
             sync_period_deviation_us=_percentiles(deviation),
             wake_lateness_us=_percentiles(window["wake_lateness_ns"].astype(np.float64)),
             loop_cpu_us=round(float(window["loop_cpu_ns"].mean()) / 1e3, 3),
-            missed_tpdo=self._missed_tpdo,
-            missed_rpdo_deadline=self._missed_deadline,
-            overruns=self._overruns,
+            counts=self._counts,
+            spreads={timing: self._histograms.spread(timing) for timing in Timing},
             lost_samples=self._lost,
             events=tuple(self._events),
         )
@@ -221,6 +220,10 @@ def sparkline(values: tuple[float | None, ...]) -> str:
     return "".join(" " if v is None else _SPARK_LEVELS[round((v - low) / span * top)] for v in values)
 
 
+def _figures(*values: float | None) -> str:
+    return " / ".join(number(value, 1) for value in values) + " µs"
+
+
 def _bar(share: float, width: int = 16) -> Text:
     """A bar from the middle, to the right for positive torque; full at the rated torque."""
     half = width // 2
@@ -272,12 +275,16 @@ def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
         ("wake-up lateness", view.wake_lateness_us),
     ):
         timing.add_row(what, " / ".join(number(value, 1) for value in figures) + " µs", "p50 / p99 / max")
-    missed = view.missed_tpdo + view.missed_rpdo_deadline + view.overruns
+    arrival, lead = view.spreads[Timing.TPDO_ARRIVAL], view.spreads[Timing.RPDO_LEAD]
+    timing.add_row("last TPDO after SYNC", _figures(arrival.p50, arrival.p99, arrival.max), "p50 / p99 / max, so far")
+    timing.add_row("last RPDO before SYNC", _figures(lead.min, lead.p1, lead.p50), "least / p1 / p50, so far")
+    counts = view.counts
     timing.add_row(
         "missed, as far as seen",
         Text(
-            f"{view.missed_tpdo} TPDO, {view.missed_rpdo_deadline} deadline, {view.overruns} overrun",
-            style="bold red" if missed else "",
+            f"{counts.missed_tpdo} TPDO, {counts.missed_rpdo_deadline} deadline, {counts.overruns} overrun, "
+            f"{counts.sync_lost} SYNC, {counts.bus_errors} bus error, {counts.send_buffer_full} buffer full",
+            style="bold red" if counts.total else "",
         ),
         f"loop {number(view.loop_cpu_us, 1)} µs a cycle",
     )

@@ -94,10 +94,10 @@ def _tiles(report: RunReport) -> str:
         ("end effector, greatest error", f"{number(distance.max, 2)} mm", f"RMS {number(distance.rms, 2)} mm", False)
     )
     cycle = report.cycle
-    missed = cycle.missed_rpdo_deadline + cycle.missed_tpdo + cycle.overruns
+    counts, missed = cycle.counts, cycle.counts.total
     note = (
-        f"{number(cycle.missed_tpdo)} TPDO, {number(cycle.missed_rpdo_deadline)} deadline, "
-        f"{number(cycle.overruns)} overrun; of {number(cycle.count)} cycles"
+        f"{number(counts.missed_tpdo)} TPDO, {number(counts.missed_rpdo_deadline)} deadline, "
+        f"{number(counts.overruns)} overrun, {number(counts.sync_lost)} SYNC; of {number(cycle.count)} cycles"
     )
     tiles.append(("missed in the cycle", number(missed), note, missed > 0))
     return "".join(

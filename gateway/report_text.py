@@ -10,9 +10,20 @@ from rich.text import Text
 
 from gateway import paper_reference as paper
 from gateway.analysis import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
+from gateway.histograms import Timing
 
 NOTHING = "–"
-_COUNTED_FAULTS = frozenset({"TPDOs missed", "RPDO deadlines missed", "overruns", "samples lost"})
+_COUNTED_FAULTS = frozenset(
+    {
+        "TPDOs missed",
+        "RPDO deadlines missed",
+        "overruns",
+        "SYNCs lost",
+        "cycles with bus errors",
+        "cycles with a full send buffer",
+        "samples lost",
+    }
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,18 +131,30 @@ def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
     def spread(figures: Distribution) -> str:
         return " / ".join(number(value, 1) for value in (figures.p50, figures.p99, figures.max))
 
-    lead = cycle.rpdo_lead_us
+    counts = cycle.counts
+    lead, leads = cycle.rpdo_lead_us, cycle.histograms.spread(Timing.RPDO_LEAD)
+    times = cycle.histograms.spread(Timing.LOOP_TIME)
     return [
         ("cycles recorded", f"{number(cycle.count)} of {cycle.period_s * 1e3:g} ms"),
-        ("TPDOs missed", number(cycle.missed_tpdo)),
-        ("RPDO deadlines missed", number(cycle.missed_rpdo_deadline)),
-        ("overruns", number(cycle.overruns)),
+        ("TPDOs missed", number(counts.missed_tpdo)),
+        ("cycles with a late TPDO", number(counts.late_tpdo)),
+        ("RPDO deadlines missed", number(counts.missed_rpdo_deadline)),
+        ("overruns", number(counts.overruns)),
+        ("SYNCs lost", number(counts.sync_lost)),
+        ("cycles with bus errors", number(counts.bus_errors)),
+        ("cycles with a full send buffer", number(counts.send_buffer_full)),
         ("samples lost", number(cycle.lost_samples)),
         ("|SYNC period − cycle|, p50 / p99 / max", f"{spread(cycle.sync_period_deviation_us)} µs"),
         ("wake-up lateness, p50 / p99 / max", f"{spread(cycle.wake_lateness_us)} µs"),
         ("last TPDO after SYNC, p50 / p99 / max", f"{spread(cycle.tpdo_arrival_us)} µs"),
-        ("last RPDO before SYNC, least / greatest", f"{number(lead.min, 1)} / {number(lead.max, 1)} µs"),
-        ("processor time of the loop a cycle", f"{number(cycle.loop_cpu_us_per_cycle, 1)} µs"),
+        (
+            "last RPDO before SYNC, least / p1 / p50",
+            f"{' / '.join(number(value, 1) for value in (lead.min, leads.p1, leads.p50))} µs",
+        ),
+        (
+            "processor time of the loop a cycle, mean / p99",
+            f"{number(cycle.loop_cpu_us_per_cycle, 1)} / {number(times.p99, 1)} µs",
+        ),
     ]
 
 

@@ -54,7 +54,7 @@ def test_a_missed_tpdo_is_counted_and_leaves_the_figures_of_that_axis_alone() ->
     samples["position_actual"][500] = [-9999, 9999]
     samples["flags"][500] = missed_tpdo_flag(1)
     whole = report(samples)
-    assert whole.cycle.missed_tpdo == 1
+    assert whole.cycle.counts.missed_tpdo == 1
     assert whole.steady.axes[1].following_error_counts.max == 0.0
     assert whole.steady.axes[1].samples == 1999
     # the other axis' TPDO came: its error is real
@@ -67,7 +67,7 @@ def test_both_axes_missing_in_one_cycle_are_two_missed_tpdos() -> None:
     samples["flags"][3] = missed_tpdo_flag(0) | missed_tpdo_flag(1)
     samples["flags"][4] = SampleFlag.MISSED_RPDO_DEADLINE | SampleFlag.OVERRUN
     cycle = report(samples).cycle
-    assert (cycle.missed_tpdo, cycle.missed_rpdo_deadline, cycle.overruns) == (2, 1, 1)
+    assert (cycle.counts.missed_tpdo, cycle.counts.missed_rpdo_deadline, cycle.counts.overruns) == (2, 1, 1)
 
 
 def test_velocity_is_the_one_sample_difference_and_the_smoothed_one_spans_ten() -> None:

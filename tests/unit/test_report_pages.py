@@ -224,7 +224,7 @@ def test_the_view_is_of_the_last_cycle_alone(ring: RingWriter) -> None:
     assert servo.state == "fault"
     assert (servo.torque_nm, servo.torque_max_abs_nm, servo.torque_of_rated) == (0.25, 0.4, 0.5)
     assert (view.machine_cycle, view.master_deg, view.master_rpm) == (2, pytest.approx(35.64), 60.0)
-    assert view.missed_tpdo == 3
+    assert view.counts.missed_tpdo == 3
     assert view.sync_period_deviation_us == (0.0, 0.0, 25.0)
     assert view.phase == "cam"
     # 97 counts are in the last part of what is known: 35.64 deg is in part 4 of 48
