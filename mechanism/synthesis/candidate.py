@@ -9,7 +9,8 @@ from mechanism.closure import ClosureTrack, track_closure
 from mechanism.curve import DesiredCurve, read_only
 from mechanism.errors import SynthesisError
 from mechanism.five_bar import FiveBar
-from mechanism.synthesis.task import SynthesisTask, Term, Timing
+from mechanism.synthesis.objective import solved_timing
+from mechanism.synthesis.task import SynthesisTask, Term
 
 Float = NDArray[np.float64]
 
@@ -38,9 +39,8 @@ class Candidate:
 
     def curve(self) -> DesiredCurve:
         """The task's curve with its crank angles (solved for if free). Raises CurveError if they do not rise."""
-        if self.task.timing is Timing.FREE or self.task.theta2 is None:
-            raise SynthesisError("free timing is not there yet")
-        return DesiredCurve(self.task.theta2, self.task.x, self.task.y, self.task.source)
+        theta2 = solved_timing(self.task, self.variables)
+        return DesiredCurve(theta2, self.task.x, self.task.y, self.task.source)
 
     def servo_motion(self) -> ClosureTrack:
         """The servo's motion over the cycle, and the structural error point by point. Raises CurveError as `curve`."""
