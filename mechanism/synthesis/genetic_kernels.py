@@ -21,6 +21,7 @@ BITS: Final = 10
 STRING: Final = 8 * BITS
 DRAWS: Final = 4 + 2 * STRING
 """Random numbers that a pair of children takes: two parents, crossover or not, where, and every bit of both."""
+_LEAST_OBJECTIVE: Final = 1e-9
 SCALING: Final = 2.0
 """How much fitter than the average the fittest counts after scaling."""
 
@@ -36,32 +37,30 @@ def decode(codes: Integers, lower: Float, upper: Float, population: Float) -> No
 
 @kernel
 def scale_fitness(values: Float, fitness: Float) -> None:
-    """Fitness from objectives: how much better than the worst, scaled linearly so that the average stays and the best
+    """Fitness from objectives (0 or more): their reciprocals, scaled linearly so that the average stays and the best
     counts `SCALING` times the average, or less where the worst would fall below 0.
     """
-    worst = -inf
-    for j in range(values.size):
-        if values[j] < inf:
-            worst = max(worst, values[j])
     total = 0.0
     best = 0.0
+    least = inf
     for j in range(values.size):
-        fitness[j] = worst - values[j] if values[j] < inf else 0.0
+        fitness[j] = 1.0 / max(values[j], _LEAST_OBJECTIVE)
         total += fitness[j]
         best = max(best, fitness[j])
+        least = min(least, fitness[j])
     average = total / values.size
     if not best > average:
         for j in range(values.size):
             fitness[j] = 1.0
         return
-    # The least is 0, so the line either keeps it there or would take it below: then it is cut to where the best fits.
-    slope = (SCALING - 1.0) * average / (best - average)
-    offset = average * (best - SCALING * average) / (best - average)
-    if offset < 0.0:
-        slope = 1.0
-        offset = 0.0
+    if least > (SCALING * average - best) / (SCALING - 1.0):
+        slope = (SCALING - 1.0) * average / (best - average)
+        offset = average * (best - SCALING * average) / (best - average)
+    else:
+        slope = average / (average - least)
+        offset = -least * slope
     for j in range(values.size):
-        fitness[j] = slope * fitness[j] + offset
+        fitness[j] = max(slope * fitness[j] + offset, 0.0)
 
 
 @kernel
