@@ -313,6 +313,32 @@ class FeedForwardSection(Model):
     axes: dict[AxisName, NominalAxisSection] = Field(default_factory=dict[AxisName, NominalAxisSection])
 
 
+class LearnedAxisSection(Model):
+    """How the error of an axis becomes torque in learning; what is left out is what its ``emulation`` gains say."""
+
+    proportional_Nm_per_rad: NotNegative | None = None
+    derivative_Nms_per_rad: NotNegative | None = None
+    bound_Nm: Positive | None = None
+    """Greatest correction; null: half of the rated torque."""
+
+
+class LearningSection(Model):
+    """Learning from cycle to cycle: a torque correction that repeats with the master's revolution."""
+
+    enabled: bool = False
+    memory: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
+    """File to resume from and to write to, or a folder that has one for each profile; relative to the configuration."""
+    gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """Share of the remaining error that is taken into the correction in each revolution."""
+    window_ms: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+    """Half width of the zero-phase low pass."""
+    settle_ms: Annotated[float, Field(ge=0.0, le=60_000.0)] = 100.0
+    """Constant speed before anything is learned."""
+    bins: Annotated[int, Field(ge=16, le=4096)] = 256
+    """Places of a revolution for which a torque is kept."""
+    axes: dict[AxisName, LearnedAxisSection] = {}
+
+
 class EmulatorSection(Model):
     """The emulated machine as a whole."""
 
@@ -333,6 +359,7 @@ class GatewayConfig(Model):
     bus: BusSection = BusSection()
     guard: GuardSection = GuardSection()
     feed_forward: FeedForwardSection = FeedForwardSection()
+    learning: LearningSection = LearningSection()
     emulator: EmulatorSection = EmulatorSection()
     _path: Path = Path()
     _text: str = ""
@@ -396,9 +423,11 @@ class GatewayConfig(Model):
                 f"bus.heartbeat_timeout_ms: {self.bus.heartbeat_timeout_ms} is below twice heartbeat_ms "
                 f"({self.bus.heartbeat_ms}), a single late heartbeat would stop the machine"
             )
-        for name in self.feed_forward.axes:
-            if name not in self.axes:
-                raise ValueError(f"feed_forward.axes.{name}: there is no such axis, they are {' and '.join(self.axes)}")
+        for section, names in (("feed_forward", self.feed_forward.axes), ("learning", self.learning.axes)):
+            for name in names:
+                if name not in self.axes:
+                    known = " and ".join(self.axes)
+                    raise ValueError(f"{section}.axes.{name}: there is no such axis, they are {known}")
         load = self.bus.load(len(self.axes))
         if load > MAX_BUS_LOAD:
             raise ValueError(

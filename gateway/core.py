@@ -27,6 +27,7 @@ from gateway.cycle import CyclicLoop
 from gateway.demand import CamDemand
 from gateway.errors import CommissioningError, GatewayError
 from gateway.guard import Condition, Guard, StopReason
+from gateway.learning import LearnedTorque
 from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.sample import Phase
 from mechanism.motion import MasterPlan
@@ -154,6 +155,12 @@ class GatewayCore:
             return []
         events, self._events = self._events, []
         return events
+
+    @property
+    def learned(self) -> LearnedTorque | None:
+        """What has been learned of the demand's cam until now; None if nothing has."""
+        observer = self._demand.observer
+        return None if observer is None else observer.learned
 
     # -- commands from outside -----------------------------------------------------------------------------------
 
@@ -303,7 +310,7 @@ class GatewayCore:
         if guard.reaction is None and not self._is_stop_requested:
             self._step("moving")
             demand.begin(self._plan, [axis.channel.target for axis in self._axes])
-            loop.follow(demand)
+            loop.follow(demand, demand.observer)
             while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
                 if self._is_stop_requested:
                     loop.controlled_stop()

@@ -8,7 +8,7 @@ its actual position. So the following error of cycle k compares the target that 
 value latched at SYNC(k): both belong to the same instant.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from operator import attrgetter
 from typing import Final, Protocol
 
@@ -23,6 +23,7 @@ from gateway.demand import Demand
 from gateway.guard import Condition, Guard
 from gateway.reactions import CoupledStop
 from gateway.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
+from gateway.units import HALF_RANGE, RANGE_MASK
 from gateway.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
 
 __all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop", "SampleSink"]
@@ -53,6 +54,7 @@ _unpack_tpdo: Final = TPDO_LAYOUT.unpack_from
 _pack_rpdo: Final = RPDO_LAYOUT.pack
 _TPDO_LENGTH: Final = TPDO_LAYOUT.length
 _COMMISSIONING: Final = Phase.COMMISSIONING
+_CAM: Final = Phase.CAM
 
 
 class SampleSink(Protocol):
@@ -60,6 +62,17 @@ class SampleSink(Protocol):
 
     def append(self, *values: float) -> None:
         """Take one sample, the values in the order of ``SampleLayout.pack_into``."""
+        ...
+
+
+class ErrorObserver(Protocol):
+    """Who is shown the following errors of every cycle in motion, before the next demand is taken."""
+
+    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
+        """Errors in counts, one an axis, and the master's demand (rad, rad/s) for the instant at which they were.
+
+        ``is_steady``: the machine is at speed on the cam, every TPDO has come, and nothing that is guarded is amiss.
+        """
         ...
 
 
@@ -94,6 +107,7 @@ class CyclicLoop:
         "_is_taken",
         "_no_torque_offsets",
         "_no_velocities",
+        "_observer",
         "_provisional",
         "_sent",
         "_sent_ns",
@@ -162,6 +176,7 @@ class CyclicLoop:
         self._cpu_ns = 0
         self._cpu_last_ns = 0
         self._demand: Demand | None = None
+        self._observer: ErrorObserver | None = None
         self._all_axes = (1 << len(axes)) - 1
         deadline_ns = round(period_ns * TPDO_DEADLINE) if tpdo_deadline_ns is None else tpdo_deadline_ns
         self._deadline_share_ns = period_ns - deadline_ns
@@ -204,9 +219,13 @@ class CyclicLoop:
         """No further SYNC."""
         self.is_running = False
 
-    def follow(self, demand: Demand | None) -> None:
-        """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions."""
+    def follow(self, demand: Demand | None, observer: ErrorObserver | None = None) -> None:
+        """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions.
+
+        ``observer`` is shown the following errors as long as the demand is followed.
+        """
         self._demand = demand
+        self._observer = observer
 
     def command(self, controlword: int) -> None:
         """Send this controlword to every axis from the next RPDO on."""
@@ -231,7 +250,7 @@ class CyclicLoop:
             is_coupled = self._coupled_stop is not None and self._demand is not None
             # It begins with the actual values of the cycle that is closed next.
             self._is_coupled_stop_due = is_coupled
-            self._demand = None
+            self.follow(None)
             self.phase = Phase.QUICK_STOP
             if not is_coupled:
                 self.command(COMMAND_QUICK_STOP)
@@ -411,6 +430,8 @@ class CyclicLoop:
             self._applied = self._sent
         if self.phase is not _COMMISSIONING:
             self._check(now_ns)
+        if self._observer is not None:
+            self._show_errors(self._observer)
         if self._is_coupled_stop_due:
             self._begin_coupled_stop()
         demand = self._demand
@@ -453,6 +474,19 @@ class CyclicLoop:
         if self._coupled_stop is not None:
             self._coupled_stop.begin(self._in_force[0], self._in_force[1], self._sent[3])
             self._demand = self._coupled_stop
+
+    def _show_errors(self, observer: ErrorObserver) -> None:
+        position, velocity, _, targets, _, phase = self._in_force
+        errors = [
+            (target - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+            for target, axis in zip(targets, self.axes, strict=True)
+        ]
+        is_steady = phase is _CAM and not self._awaited and self.guard.is_quiet
+        observer.observe(position, velocity, errors, is_steady)
+
+    def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:
+        cycles = self.guard.persistence(condition)
+        self.guard.hold(condition, number, cycles, cycles, now_ns)
 
     def react(self) -> None:
         """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""

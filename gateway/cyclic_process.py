@@ -57,6 +57,8 @@ class CyclicJob:
     bit_rate: int | None
     parent_pid: int
     is_homing_again: bool = False
+    learn: str | None = None
+    """File or folder with what has been learned; None leaves it to the configuration."""
 
     def to_json(self) -> str:
         """The job as it is sent to the process."""

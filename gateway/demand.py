@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
+from gateway.learning import LearningObserver
 from gateway.sample import Phase
 from gateway.torque_offsets import TorqueOffsets
 from gateway.units import AxisUnits, wrap_counts
@@ -105,6 +106,11 @@ class CamDemand:
         self._step = 0
         self._is_stopping = False
         self.master_position, self.master_velocity, self._acceleration = plan.at(0.0)
+
+    @property
+    def observer(self) -> LearningObserver | None:
+        """Who is to be shown the following errors; None if nothing is learned from them."""
+        return None if self._torques is None else self._torques.observer
 
     @property
     def is_finished(self) -> bool:

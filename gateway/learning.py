@@ -1,5 +1,6 @@
 """Learning from cycle to cycle: the correction that repeats with the master's revolution; see `learning_kernels`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import tau
 from typing import Final
@@ -7,12 +8,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from config.conversion import controller_gains
+from config.schema import GatewayConfig, LearnedAxisSection
 from gateway import learning_kernels as kernels
+from gateway.units import AxisUnits
 
 Float = NDArray[np.float64]
 
-MINIMUM_BINS: Final = 16
-MAXIMUM_BINS: Final = 4096
+BOUND_SHARE: Final = 0.5
+"""Share of the rated torque that a correction may reach unless the configuration says otherwise."""
+MS_PER_S: Final = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,15 +79,12 @@ class Learning:
         # The first call loads the machine code, which must not happen within a cycle.
         self.observe(0.0, 1.0, False, 0.0, 0.0)
         self.torques(0.0, 1.0)
-        self._warm_up()
-        if learned is not None:
-            self._memory[:] = _resampled(learned.torque, bins)
-            np.clip(self._memory, -self._settings[[[5], [6]]], self._settings[[[5], [6]]], out=self._memory)
-            self._state[kernels.SPEED] = learned.speed
-
-    def _warm_up(self) -> None:
         self._state[:] = 0.0
         self._state[kernels.BIN] = -1.0
+        if learned is not None:
+            bound = np.array(settings.bound_Nm)[:, np.newaxis]
+            self._memory[:] = np.clip(_resampled(learned.torque, bins), -bound, bound)
+            self._state[kernels.SPEED] = learned.speed
 
     @property
     def learned(self) -> LearnedTorque | None:
@@ -116,6 +118,56 @@ class Learning:
             master_error,
             slave_error,
         )
+
+
+class LearningObserver:
+    """Shows the cycle's following errors, which are counts, to what learns from them."""
+
+    __slots__ = ("_learning", "_rad_per_count")
+
+    def __init__(self, learning: Learning, units: tuple[AxisUnits, AxisUnits]) -> None:
+        self._learning = learning
+        self._rad_per_count = tuple(tau / unit.counts_per_revolution for unit in units)
+
+    @property
+    def learned(self) -> LearnedTorque | None:
+        """What has been learned until now, a copy; None if nothing has."""
+        return self._learning.learned
+
+    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
+        """Following errors of one cycle; see `gateway.cycle.ErrorObserver`."""
+        master, slave = self._rad_per_count
+        self._learning.observe(master_position, master_velocity, is_steady, master * errors[0], slave * errors[1])
+
+
+def build_learning(config: GatewayConfig, learned: LearnedTorque | None = None) -> Learning:
+    """What the configuration's ``learning`` section describes, whether it is enabled or not."""
+    section = config.learning
+    master, slave = (_axis_law(config, name) for name in config.axis_names)
+    return Learning(
+        LearningSettings(
+            gain=section.gain,
+            proportional_Nm_per_rad=(master[0], slave[0]),
+            derivative_Nms_per_rad=(master[1], slave[1]),
+            bound_Nm=(master[2], slave[2]),
+            window_s=section.window_ms / MS_PER_S,
+            settle_cycles=round(section.settle_ms / MS_PER_S / config.cycle_s),
+            bins=section.bins,
+        ),
+        learned,
+    )
+
+
+def _axis_law(config: GatewayConfig, name: str) -> tuple[float, float, float]:
+    """Proportional part, derivative part and bound of an axis."""
+    given, axis = config.learning.axes.get(name, LearnedAxisSection()), config.axes[name]
+    gains = controller_gains(axis)
+    rate = gains.derivative_Nms_per_rad + gains.damping_Nms_per_rad
+    return (
+        gains.proportional_Nm_per_rad if given.proportional_Nm_per_rad is None else given.proportional_Nm_per_rad,
+        rate if given.derivative_Nms_per_rad is None else given.derivative_Nms_per_rad,
+        BOUND_SHARE * axis.rated_torque_Nm if given.bound_Nm is None else given.bound_Nm,
+    )
 
 
 def _resampled(torque: Float, bins: int) -> Float:

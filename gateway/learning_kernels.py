@@ -98,7 +98,7 @@ def _set_window(taps: Float, state: Float, settings: Float, bins: int, speed: fl
     """Lay the window for this speed into ``taps``: row 0 the low pass, row 1 its derivative with respect to time."""
     per_s = bins * speed / tau
     half = floor(settings[WINDOW_S] * per_s + 0.5)
-    half = min(max(half, 1), MAXIMUM_HALF_WINDOW)
+    half = max(1, min(half, MAXIMUM_HALF_WINDOW, bins // 4))
     state[HALF] = half
     total = 0.0
     for h in range(-half, half + 1):
@@ -134,14 +134,15 @@ def _learn_bin(memory: Float, work: Float, taps: Float, state: Float, settings: 
 
 
 @kernel
-def _rescale(memory: Float, state: Float, speed: float) -> None:
-    """Let the memory be one of another speed."""
+def _rescale(memory: Float, state: Float, settings: Float, speed: float) -> None:
+    """Let the memory be one of another speed, as if it were all forces of inertia: a beginning, no more."""
     if state[SPEED] > 0.0:
         ratio = speed / state[SPEED]
         share = ratio * ratio
         for axis in range(AXES):
+            bound = settings[BOUND + axis]
             for b in range(memory.shape[1]):
-                memory[axis, b] *= share
+                memory[axis, b] = min(max(share * memory[axis, b], -bound), bound)
     state[SPEED] = speed
 
 
@@ -172,8 +173,8 @@ def observe(
     if state[STEADY] < settings[SETTLE]:
         state[STEADY] += 1.0
         return
-    if abs(speed - state[SPEED]) > SPEED_TOLERANCE * speed:
-        _rescale(memory, state, speed)
+    if state[HALF] == 0.0 or abs(speed - state[SPEED]) > SPEED_TOLERANCE * speed:
+        _rescale(memory, state, settings, speed)
         _set_window(taps, state, settings, bins, speed)
     b = floor(position * (bins / tau)) % bins
     last = int(state[BIN])

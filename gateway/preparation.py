@@ -16,6 +16,7 @@ from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
+from gateway.learning import Learning, build_learning
 from gateway.powering import AxisSetup
 from gateway.reactions import CoupledStop
 from gateway.torque_offsets import build_torque_offsets, torque_violations
@@ -249,8 +250,12 @@ def build_core(
     sink: SampleSink,
     cpu_clock: Callable[[], int] | None = None,
     is_homing_again: bool = False,
+    learning: Learning | None = None,
 ) -> GatewayCore:
-    """Put the gateway's parts together; see ``gateway.core``."""
+    """Put the gateway's parts together; see ``gateway.core``.
+
+    ``learning``: what has been learned before and is to be gone on with; None leaves it to the configuration.
+    """
     channels = [
         AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.following_error_counts)
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
@@ -272,13 +277,15 @@ def build_core(
     loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock, None, watch, coupled_stop)
     loop.sync_gap_limit = config.guard.sync_lost.limit_cycles
     units = (channels[0].units, channels[1].units)
+    if learning is None and config.learning.enabled:
+        learning = build_learning(config)
     demand = CamDemand(
         profile,
         units,
         config.cycle_s,
         config.motion.ramp_acceleration_rad_per_s2,
         config.motion.ramp_jerk_rad_per_s3,
-        build_torque_offsets(config, profile, units),
+        build_torque_offsets(config, profile, units, learning),
     )
     return GatewayCore(
         setups, network_settings(config), build_master(config), loop, demand, run_plan, guard, is_homing_again

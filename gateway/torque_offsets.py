@@ -20,7 +20,7 @@ from config.conversion import (
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError
 from gateway.feed_forward import FeedForward
-from gateway.learning import Learning
+from gateway.learning import Learning, LearningObserver
 from gateway.units import INT16_MAX, AxisUnits
 from mechanism.cam_profile import CamProfile
 
@@ -39,7 +39,7 @@ def torque_lead_s(cycle_s: float, torque_delay_s: float) -> float:
 class TorqueOffsets:
     """The torque offsets of both axes in per mille of rated torque, model and learning together, bounded."""
 
-    __slots__ = ("_feed_forward", "_lead_s", "_limits", "_units", "learning")
+    __slots__ = ("_feed_forward", "_lead_s", "_learning", "_limits", "_units", "observer")
 
     def __init__(
         self,
@@ -54,7 +54,9 @@ class TorqueOffsets:
         self._limits = tuple(min(unit.permille(limit), INT16_MAX) for unit, limit in zip(units, limits_Nm, strict=True))
         self._lead_s = lead_s
         self._feed_forward = feed_forward
-        self.learning = learning
+        self._learning = learning
+        self.observer = None if learning is None else LearningObserver(learning, units)
+        """Takes the following errors; None if nothing is learned."""
 
     def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
         """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""
@@ -64,8 +66,8 @@ class TorqueOffsets:
         master = slave = 0.0
         if self._feed_forward is not None:
             master, slave = self._feed_forward.torques(position, velocity, acceleration)
-        if self.learning is not None:
-            learned = self.learning.torques(position, velocity)
+        if self._learning is not None:
+            learned = self._learning.torques(position, velocity)
             master += learned[0]
             slave += learned[1]
         units, limits = self._units, self._limits

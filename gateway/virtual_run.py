@@ -9,6 +9,7 @@ from drivers.virtual_time import VirtualBus
 from gateway.core import GatewayCore
 from gateway.errors import GatewayError
 from gateway.event_text import describe
+from gateway.learning import Learning
 from gateway.preparation import PreparedRun, build_core
 from gateway.recording import RecordingMetadata, RecordingSink, RecordingWriter
 from gateway.run_constants import RunConstants
@@ -31,12 +32,13 @@ def run_virtual(
     *,
     is_overwriting: bool = False,
     with_frames: bool = True,
+    learning: Learning | None = None,
     on_progress: Callable[[float, GatewayCore], None] | None = None,
 ) -> GatewayCore:
     """Carry out a prepared run against ``machine``, record it to ``path``, and return the gateway's core afterwards.
 
-    The recording is a function of configuration, cam and seed alone, byte for byte. ``on_progress`` is called with the
-    virtual time in seconds now and then, and may ask the core for a stop.
+    The recording is a function of configuration, cam, seed and what ``learning`` begins with, byte for byte.
+    ``on_progress`` is called with the virtual time in seconds now and then, and may ask the core for a stop.
 
     Raises RecordingError if the file cannot be written, GatewayError if the session does not end.
     """
@@ -44,7 +46,7 @@ def run_virtual(
     metadata = RecordingMetadata(RunConstants.from_config(config, prepared.cam.closure), config.text, cam_text)
     with RecordingWriter(path, metadata, overwrite=is_overwriting) as writer:
         sink = RecordingSink(writer)
-        core = build_core(config, prepared.cam.profile, prepared.plan, sink)
+        core = build_core(config, prepared.cam.profile, prepared.plan, sink, learning=learning)
 
         def on_event(node: int, event: Event) -> None:
             kind, text, data = describe(event)
