@@ -32,6 +32,7 @@ from gateway.cycle_host import CycleHost
 from gateway.errors import GatewayError
 from gateway.event_text import describe
 from gateway.guard import StopReason
+from gateway.learning_store import LearningStore, open_store
 from gateway.preparation import build_core, plan
 from gateway.ring import RingWriter, RunState, StopRequest
 from mechanism.cam_file import parse_cam_file
@@ -142,11 +143,30 @@ def join_bus(address: BusAddress, config: GatewayConfig, ring: RingWriter) -> Cy
     return bus
 
 
+def keep_memory(store: LearningStore, core: GatewayCore, ring: RingWriter) -> GatewayError | None:
+    """Write what has been learned; returns why it could not be written."""
+    try:
+        if store.keep(core):
+            ring.append_event(time.monotonic_ns(), "learning", f"what was learned is in {store.path}")
+    except GatewayError as error:
+        return error
+    return None
+
+
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
     """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
     config = parse_config(job.config_text, Path(job.config_path))
     profile = parse_cam_file(job.cam_text, "cam of the job").cam.profile
-    core = build_core(config, profile, plan(config, job.machine_cycles), ring, time.thread_time_ns, job.is_homing_again)
+    store = open_store(config, profile, None if job.learn is None else Path(job.learn))
+    core = build_core(
+        config,
+        profile,
+        plan(config, job.machine_cycles),
+        ring,
+        time.thread_time_ns,
+        job.is_homing_again,
+        None if store is None else store.learning(),
+    )
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
     def on_terminate(_number: int, _frame: FrameType | None) -> None:
@@ -185,6 +205,8 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         if bus is not None:
             bus.close()
     poll()
+    if store is not None and failure is None:
+        failure = keep_memory(store, core, ring)
     if failure is not None:
         for sentence in str(failure).splitlines():
             ring.append_event(time.monotonic_ns(), "failure", sentence)

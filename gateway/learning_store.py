@@ -5,6 +5,7 @@ from typing import Final
 
 from config.schema import GatewayConfig
 from gateway.core import GatewayCore
+from gateway.errors import UsageError
 from gateway.guard import StopReason
 from gateway.learning import Learning, build_learning
 from gateway.learning_file import cam_crc32, memory_file, read_memory, write_memory
@@ -22,11 +23,13 @@ class LearningStore:
     def __init__(self, config: GatewayConfig, profile: CamProfile, path: Path) -> None:
         """``path``: the file, which need not be there yet, or a folder with one for each profile.
 
-        Raises UsageError for a file that is no memory of this profile.
+        Raises UsageError for a file that is no memory of this profile, and for one that could not be written.
         """
         crc = cam_crc32(profile)
         self._config = config
         self.path: Final = memory_file(path, config.name, crc)
+        if not self.path.parent.is_dir():
+            raise UsageError(f"{self.path}: cannot be written (there is no folder {self.path.parent})")
         self._memory = read_memory(self.path, crc, config.axis_names)
 
     def learning(self) -> Learning:

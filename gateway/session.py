@@ -93,10 +93,14 @@ def run_realtime(
     is_overwriting: bool = False,
     with_frames: bool = False,
     is_homing_again: bool = False,
+    learn: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> None:
     """Carry out a prepared run on a bus and record it; ``with_frames`` also records every frame on the bus.
+
+    ``learn``: file or folder of what has been learned, see ``gateway.learning_store``; None leaves it to the
+    configuration.
 
     Raises BusError for a bus that is not there, GatewayError with what else went wrong: drives that are not what they
     should be, a process that died. A stop that the guard called for is no error here: the recording tells it.
@@ -141,6 +145,7 @@ def run_realtime(
             bit_rate=address.bit_rate,
             parent_pid=os.getpid(),
             is_homing_again=is_homing_again,
+            learn=None if learn is None else str(learn.absolute()),
         )
         loop = subprocess.Popen(
             [sys.executable, "-m", "gateway.cyclic_process"],

@@ -30,6 +30,7 @@ from gateway.cli.terminal import (
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
     from gateway.bus_address import BusAddress
+    from gateway.learning_store import LearningStore
     from gateway.preparation import PreparedRun
     from gateway.recording import Recording
 
@@ -39,6 +40,7 @@ RUN_EPILOG = """Examples:
   drive-gateway run paper                                  on the configured bus, e.g. against sim-drive
   drive-gateway run my-machine.yaml -i socketcan -c can0 --cycles 100 --record run.mcap
   drive-gateway run paper --virtual-time --seed 1 --json   gateway and emulator in virtual time
+  drive-gateway run paper --learn memory.json              learn from cycle to cycle, go on where the last run ended
 
 The first Ctrl-C stops the machine on the cam, a second one with a quick stop.
 """
@@ -95,6 +97,7 @@ def _run_on_bus(
     is_overwriting: bool,
     frames: bool | None,
     is_homing_again: bool = False,
+    learn: Path | None = None,
 ) -> None:
     from gateway.session import Progress as RunProgress
     from gateway.session import StopSwitch, run_realtime
@@ -103,7 +106,9 @@ def _run_on_bus(
     console = messages()
 
     def on_event(event: dict[str, Any]) -> None:
-        if event.get("kind") in {"guard", "emergency", "heartbeat_lost"}:
+        if event.get("kind") == "learning":
+            console.print(event["text"], soft_wrap=True, markup=False)
+        elif event.get("kind") in {"guard", "emergency", "heartbeat_lost"}:
             console.print(f"  {event['text']}", style="yellow", markup=False)
         elif event.get("kind") == "realtime" and not event.get("is_on"):
             console.print(f"  {event['text']}", style="dim", markup=False)
@@ -128,13 +133,20 @@ def _run_on_bus(
             is_overwriting=is_overwriting,
             with_frames=address.interface == "socketcan" if frames is None else frames,
             is_homing_again=is_homing_again,
+            learn=learn,
             on_progress=on_progress,
             on_event=on_event,
         )
 
 
 def _run_virtually(
-    prepared: "PreparedRun", cam: str, recording: Path, seed: int, is_overwriting: bool, with_frames: bool = True
+    prepared: "PreparedRun",
+    cam: str,
+    recording: Path,
+    seed: int,
+    is_overwriting: bool,
+    with_frames: bool = True,
+    store: "LearningStore | None" = None,
 ) -> float:
     """Carry out the run in virtual time; returns machine seconds per second."""
     from gateway.core import GatewayCore
@@ -169,8 +181,11 @@ def _run_virtually(
             seed,
             is_overwriting=is_overwriting,
             with_frames=with_frames,
+            learning=None if store is None else store.learning(),
             on_progress=on_progress,
         )
+    if store is not None and store.keep(core):
+        messages().print(f"what was learned is in {store.path}", soft_wrap=True, markup=False)
     if core.failure is not None:
         raise core.failure
     return reached_s / (time.monotonic() - started)
@@ -234,6 +249,14 @@ def run(
         bool,
         typer.Option("--home-here", help="Home the axes where they stand, even if their drives are homed already."),
     ] = False,
+    learn: Annotated[
+        Path | None,
+        typer.Option(
+            "--learn",
+            metavar="PATH",
+            help="Learn from cycle to cycle: resume from this file and write to it; in a folder, one file a profile.",
+        ),
+    ] = None,
     interface: InterfaceOption = None,
     channel: ChannelOption = None,
     port: PortOption = None,
@@ -243,17 +266,19 @@ def run(
     """Commission the drives, ramp up, run the machine cycles on the cam, ramp down, disable; record and report it."""
     from config.loading import load_config
     from gateway.bus_address import resolve_bus
+    from gateway.learning_store import open_store
 
     settings = load_config(config)
     recording = record or Path(f"{settings.name}-{time.strftime('%Y%m%d-%H%M%S')}.mcap")
     require_absent(recording, is_overwriting)
     prepared, cam = _prepare(settings, cycles)
+    store = open_store(settings, prepared.cam.profile, learn)
     if virtual_time:
-        _run_virtually(prepared, cam, recording, seed, is_overwriting, frames is not False)
+        _run_virtually(prepared, cam, recording, seed, is_overwriting, frames is not False, store)
     else:
         count = settings.motion.machine_cycles if cycles is None else cycles
         address = resolve_bus(settings.bus, interface, channel, port)
-        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here)
+        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here, learn)
     _show(recording, as_json, None, is_machine_left=not virtual_time)
 
 

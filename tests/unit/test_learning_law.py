@@ -1,0 +1,213 @@
+"""The law of learning by hand: what one revolution adds, without phase shift, within its bounds, and when it does."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway import learning_kernels as kernels
+from gateway.learning import LearnedTorque, Learning, LearningObserver, LearningSettings
+from gateway.units import AxisUnits
+
+SPEED = math.tau
+CYCLE_S = 0.001
+BINS = 128
+CLEAR = slice(24, BINS)
+"""Bins away from the one at which learning began: there a window spans what is learned and what is not yet."""
+
+
+def make(learned=None, **changes):
+    values = {
+        "gain": 0.5,
+        "proportional_Nm_per_rad": (40.0, 20.0),
+        "derivative_Nms_per_rad": (0.6, 0.2),
+        "bound_Nm": (0.5, 0.25),
+        "window_s": 0.03,
+        "settle_cycles": 50,
+        "bins": BINS,
+    }
+    return Learning(LearningSettings(**(values | changes)), learned)
+
+
+class Turning:
+    """Shows a `Learning` errors that are functions of theta2, at constant speed, a cycle at a time."""
+
+    def __init__(self, learning, master_error, slave_error, speed=SPEED):
+        self.learning, self.errors, self.speed = learning, (master_error, slave_error), speed
+        self.position = 0.0
+
+    def cycle(self, is_valid=True):
+        master, slave = (error(self.position) for error in self.errors)
+        self.learning.observe(self.position, self.speed, is_valid, master, slave)
+        self.position += self.speed * CYCLE_S
+
+    def turn(self, revolutions, **options):
+        for _ in range(round(revolutions * math.tau / self.speed / CYCLE_S)):
+            self.cycle(**options)
+        return self
+
+    def learn(self, revolutions):
+        """Go on until every bin has been learned so often since the beginning."""
+        while self.learning.revolutions < revolutions:
+            self.cycle()
+        return self
+
+
+def table(learning, bins=BINS):
+    """The correction where the bins have their middle, (bins, 2)."""
+    middles = (np.arange(bins) + 0.5) * math.tau / bins
+    return np.array([learning.torques(theta2, SPEED) for theta2 in middles])
+
+
+def test_a_constant_error_becomes_gain_times_its_torque_once_a_revolution():
+    learning = make()
+    turning = Turning(learning, lambda _: 0.002, lambda _: -0.003)
+    turning.learn(1)
+    # 0.5 * 40 N m/rad * 0.002 rad, and 0.5 * 20 * -0.003.
+    assert table(learning)[CLEAR] == pytest.approx(np.tile([0.04, -0.03], (BINS - 24, 1)))
+    turning.learn(2)
+    assert table(learning)[CLEAR] == pytest.approx(np.tile([0.08, -0.06], (BINS - 24, 1)))
+
+
+def test_an_error_that_swings_is_learned_without_phase_shift():
+    learning = make()
+    waves = 3
+    Turning(learning, lambda x: 0.001 * math.sin(waves * x), lambda x: 0.001 * math.cos(waves * x)).learn(1)
+    # The window is 0.03 s either way: 0.03 * 128 bins/s = 3.84, so 4 bins; what it leaves of 3 waves in 128 bins:
+    weights = [1 + math.cos(math.pi * h / 5) for h in range(-4, 5)]
+    left = sum(w * math.cos(math.tau * waves * h / BINS) for h, w in zip(range(-4, 5), weights, strict=True))
+    left /= sum(weights)
+    rate = waves * SPEED
+    middles = (np.arange(BINS) + 0.5) * math.tau / BINS
+    sine, cosine = np.sin(waves * middles), np.cos(waves * middles)
+    expected = 0.5 * 0.001 * left * np.stack([40 * sine + 0.6 * rate * cosine, 20 * cosine - 0.2 * rate * sine], axis=1)
+    assert table(learning)[CLEAR] == pytest.approx(expected[CLEAR], abs=2e-4)
+    assert np.abs(expected).max() > 0.01
+
+
+def test_noise_of_one_revolution_is_forgotten_by_the_low_pass():
+    learning = make(derivative_Nms_per_rad=(0.0, 0.0))
+    # An error that changes sign from bin to bin is gone; 4 + 1 + 4 weights of a raised cosine leave next to nothing.
+    Turning(learning, lambda x: 0.005 * (-1) ** int(x * BINS / math.tau), lambda _: 0.0).learn(1)
+    assert np.abs(table(learning)[:, 0]).max() < 0.003
+
+
+def test_a_correction_never_leaves_its_bounds():
+    learning = make()
+    Turning(learning, lambda _: 0.02, lambda _: -0.02).turn(4.0)
+    assert table(learning) == pytest.approx(np.tile([0.5, -0.25], (BINS, 1)))
+
+
+@pytest.mark.parametrize("what", ["speed", "validity", "gap"])
+def test_nothing_is_learned_while_the_master_is_not_steady(what):
+    learning = make()
+    turning = Turning(learning, lambda _: 0.002, lambda _: 0.002)
+    turning.turn(1.15)
+    before = table(learning)
+    assert before.any()
+    for cycle in range(3000):
+        if what == "speed":
+            turning.speed *= 1.0 + 0.002 * (-1) ** cycle
+            turning.cycle()
+        elif what == "validity":
+            # One bad sample in 50 is enough: the window never fills.
+            turning.cycle(is_valid=cycle % 50 > 0)
+        else:
+            turning.position += math.pi / 2
+            turning.cycle()
+    assert np.array_equal(table(learning), before)
+
+
+def test_what_follows_a_disturbance_is_learned_again():
+    learning = make()
+    turning = Turning(learning, lambda _: 0.002, lambda _: 0.002).turn(1.15)
+    turning.turn(0.01, is_valid=False)
+    before = table(learning)
+    turning.turn(1.2)
+    assert np.all(table(learning) > before)
+
+
+def test_no_cycle_has_more_to_do_than_another():
+    learning = make(bins=256)
+    turning = Turning(learning, lambda _: 0.002, lambda _: 0.002, speed=2 * math.tau)
+    turning.turn(1.0)
+    most = 0.0
+    for _ in range(1000):
+        before = learning.revolutions
+        turning.cycle()
+        most = max(most, learning.revolutions - before)
+    # 500 cycles a revolution for 256 bins: one bin a cycle, never two.
+    assert most * 256 == pytest.approx(1.0)
+
+
+def test_at_another_speed_it_begins_with_the_square_of_the_ratio():
+    learning = make(bound_Nm=(9.0, 9.0))
+    Turning(learning, lambda _: 0.002, lambda _: 0.002).learn(1)
+    at_speed = learning.torques(1.0, SPEED)
+    assert at_speed == pytest.approx((0.04, 0.02))
+    # On a ramp it goes with the square, and upwards it waits until the speed is there.
+    assert learning.torques(1.0, 0.5 * SPEED) == pytest.approx((0.01, 0.005))
+    assert learning.torques(1.0, 0.0) == (0.0, 0.0)
+    assert learning.torques(1.0, 2.0 * SPEED) == at_speed
+    Turning(learning, lambda _: 0.0, lambda _: 0.0, speed=1.5 * SPEED).turn(0.2)
+    assert learning.torques(1.0, 1.5 * SPEED) == pytest.approx((0.09, 0.045))
+    assert learning.learned is not None
+    assert learning.learned.speed == pytest.approx(1.5 * SPEED)
+
+
+def test_what_was_learned_before_is_gone_on_with():
+    first = make()
+    assert first.learned is None
+    Turning(first, lambda _: 0.002, lambda x: 0.001 * math.sin(x)).learn(2)
+    second = make(first.learned)
+    assert np.array_equal(table(second), table(first))
+    # Without errors it stays; the low pass only rounds it off.
+    Turning(second, lambda _: 0.0, lambda _: 0.0).learn(3)
+    assert table(second)[CLEAR] == pytest.approx(table(first)[CLEAR], abs=1e-3)
+
+
+def test_another_number_of_bins_and_smaller_bounds_are_met():
+    middles = (np.arange(64) + 0.5) * math.tau / 64
+    known = LearnedTorque(SPEED, np.stack([0.4 * np.sin(middles), np.full(64, 0.3)]))
+    learning = make(known, bound_Nm=(0.3, 0.2))
+    middles = (np.arange(BINS) + 0.5) * math.tau / BINS
+    expected = np.stack([np.clip(0.4 * np.sin(middles), -0.3, 0.3), np.full(BINS, 0.2)], axis=1)
+    assert table(learning) == pytest.approx(expected, abs=1e-3)
+
+
+def test_the_observer_shows_counts_as_angles():
+    learning = make()
+    observer = LearningObserver(learning, (AxisUnits(4096, 0.0, 1.5), AxisUnits(1024, 0.0, 1.5)))
+    position = 0.0
+    for _ in range(1150):
+        observer.observe(position, SPEED, (2, -1), True)
+        position += SPEED * CYCLE_S
+    expected = (0.5 * 40.0 * 2 * math.tau / 4096, -0.5 * 20.0 * math.tau / 1024)
+    assert learning.torques(1.0, SPEED) == pytest.approx(expected)
+    assert observer.learned is not None
+
+
+@settings(max_examples=30)
+@given(st.lists(st.tuples(st.floats(-7, 7), st.floats(-1, 60), st.floats(-1, 1), st.booleans()), max_size=300))
+def test_whatever_is_shown_the_correction_is_a_number_within_its_bounds(shown):
+    learning = make(settle_cycles=0, window_s=0.01)
+    for position, speed, error, is_valid in shown:
+        learning.observe(position, speed, is_valid, error, -error)
+        master, slave = learning.torques(position, speed)
+        assert abs(master) <= 0.5
+        assert abs(slave) <= 0.25
+
+
+def test_windows_are_bounded_and_their_weights_sum_to_one():
+    for window_s, half in ((1e-4, 1), (0.01, 1), (0.03, 4), (10.0, BINS // 4)):
+        learning = make(window_s=window_s)
+        taps, state = np.zeros((2, 2 * kernels.MAXIMUM_HALF_WINDOW + 1)), np.zeros(kernels.STATES)
+        kernels._set_window(taps, state, learning._settings, BINS, SPEED)
+        assert state[kernels.HALF] == half
+        assert taps[0].sum() == pytest.approx(1.0)
+        assert taps[1].sum() == pytest.approx(0.0, abs=1e-9)
+        # The derivative of a ramp of 1 a second, one bin every 1/128 s.
+        ramp = (np.arange(2 * half + 1) - half) / BINS
+        assert taps[1, : 2 * half + 1] @ ramp == pytest.approx(1.0)
