@@ -4,7 +4,8 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from config.schema import AxisSection, GatewayConfig, LinkSection, NominalAxisSection
+from config.schema import AxisSection, GatewayConfig, LinkSection
+from config.torque_sections import NominalAxisSection, NominalLinkSection
 from mechanism.curve import DesiredCurve, load_curve_csv
 from mechanism.dynamics import DynamicsParameters, LinkParameters
 from mechanism.five_bar import Closure, FiveBar
@@ -85,15 +86,24 @@ def nominal_parameters(config: GatewayConfig) -> DynamicsParameters:
     master, slave = (_nominal_axis(config, name) for name in config.axis_names)
     return DynamicsParameters(
         five_bar=five_bar(config),
-        p=_link(links.p or own.p),
-        q=_link(links.q or own.q),
-        r=_link(links.r or own.r),
-        s=_link(links.s or own.s),
+        p=_nominal_link(links.p, own.p),
+        q=_nominal_link(links.q, own.q),
+        r=_nominal_link(links.r, own.r),
+        s=_nominal_link(links.s, own.s),
         end_effector_mass_kg=machine.end_effector_mass_kg if mass is None else mass,
         rotor_inertia_kg_m2=(master[0], slave[0]),
         gravity_m_s2=machine.gravity_m_s2 if gravity is None else gravity,
         viscous_N_m_s=(master[1], slave[1]),
         coulomb_N_m=(master[2], slave[2]),
+    )
+
+
+def _nominal_link(given: NominalLinkSection, own: LinkSection) -> LinkParameters:
+    return LinkParameters(
+        own.mass_kg if given.mass_kg is None else given.mass_kg,
+        own.com_m if given.com_m is None else given.com_m,
+        own.com_perp_m if given.com_perp_m is None else given.com_perp_m,
+        own.inertia_com_kgm2 if given.inertia_com_kgm2 is None else given.inertia_com_kgm2,
     )
 
 

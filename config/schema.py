@@ -8,8 +8,9 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from config.guard_section import GuardSection
-from config.model import Model
+from config.model import AxisName, Model, NotNegative, Point, Positive
 from config.quirks import Quirk
+from config.torque_sections import FeedForwardSection, LearningSection
 from drivers.frame import WORST_CASE_BITS
 from drivers.nmt import MAX_NODE_ID
 
@@ -19,10 +20,6 @@ MAX_BUS_LOAD: Final = 0.9
 """Share of the cycle that SYNC and PDOs may take at worst-case stuffing; the rest is SDO, heartbeats and EMCY."""
 
 Millimetres = Annotated[float, Field(ge=1.0, le=10_000.0)]
-Positive = Annotated[float, Field(gt=0.0, le=1e6)]
-NotNegative = Annotated[float, Field(ge=0.0, le=1e6)]
-Point = Annotated[tuple[float, float], Field()]
-AxisName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 
 
 class FiveBarSection(Model):
@@ -274,69 +271,6 @@ class BusSection(Model):
         """Share of the cycle that SYNC and two PDOs an axis take at worst-case bit stuffing."""
         bits = WORST_CASE_BITS[0] + 2 * axes * WORST_CASE_BITS[CYCLIC_FRAME_BYTES]
         return bits / self.bit_rate / (self.cycle_us * 1e-6)
-
-
-class NominalLinksSection(Model):
-    """Links as the feed-forward's model has them; what is left out is the machine's."""
-
-    p: LinkSection | None = None
-    q: LinkSection | None = None
-    r: LinkSection | None = None
-    s: LinkSection | None = None
-
-
-class NominalAxisSection(Model):
-    """An axis as the feed-forward's model has it; what is left out is taken from its ``emulation``."""
-
-    inertia_kgm2: Positive | None = None
-    viscous_Nms: NotNegative | None = None
-    coulomb_Nm: NotNegative | None = None
-    drive_damping_Nms: Annotated[float, Field(ge=-1e3, le=1e3)] | None = None
-    """What the drive gives by itself in proportion to the demand's velocity beyond what it takes off in proportion to
-    the actual one: from K_F - K_V unless given."""
-    torque_limit_Nm: Positive | None = None
-    """Bound of the torque offset."""
-
-
-class FeedForwardSection(Model):
-    """Torque offsets from the model of the machine along the cam."""
-
-    enabled: bool = False
-    torque_delay_us: Annotated[float, Field(ge=0.0, le=100_000.0)] | None = None
-    """From the SYNC that applies a torque offset to the torque on the shaft; null: that of the emulated drives, half a
-    servo period, their output delay and the amplifier's time constant."""
-    coulomb_velocity_rad_per_s: Positive = 0.1
-    """Speed below which dry friction fades: it must not jump where an axis reverses."""
-    links: NominalLinksSection = NominalLinksSection()
-    end_effector_mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
-    gravity_m_s2: Point | None = None
-    axes: dict[AxisName, NominalAxisSection] = Field(default_factory=dict[AxisName, NominalAxisSection])
-
-
-class LearnedAxisSection(Model):
-    """How the error of an axis becomes torque in learning; what is left out is what its ``emulation`` gains say."""
-
-    proportional_Nm_per_rad: NotNegative | None = None
-    derivative_Nms_per_rad: NotNegative | None = None
-    bound_Nm: Positive | None = None
-    """Greatest correction; null: half of the rated torque."""
-
-
-class LearningSection(Model):
-    """Learning from cycle to cycle: a torque correction that repeats with the master's revolution."""
-
-    enabled: bool = False
-    memory: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
-    """File to resume from and to write to, or a folder that has one for each profile; relative to the configuration."""
-    gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """Share of the remaining error that is taken into the correction in each revolution."""
-    window_ms: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
-    """Half width of the zero-phase low pass."""
-    settle_ms: Annotated[float, Field(ge=0.0, le=60_000.0)] = 100.0
-    """Constant speed before anything is learned."""
-    bins: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Places of a revolution for which a torque is kept."""
-    axes: dict[AxisName, LearnedAxisSection] = {}
 
 
 class EmulatorSection(Model):

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from config.conversion import controller_gains
-from config.schema import GatewayConfig, LearnedAxisSection
+from config.schema import GatewayConfig
+from config.torque_sections import LearnedAxisSection
 from gateway import learning_kernels as kernels
 from gateway.units import AxisUnits
 

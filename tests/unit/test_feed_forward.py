@@ -133,11 +133,11 @@ def test_gains_become_torques_by_equation_6():
 def test_the_model_is_the_machine_but_for_what_is_given():
     config = with_feed_forward(
         "{enabled: true, end_effector_mass_kg: 0.02, gravity_m_s2: [0, -5],"
-        " links: {q: {mass_kg: 0.05, com_m: 0.1, inertia_com_kgm2: 0.0003}},"
+        " links: {q: {mass_kg: 0.05}},"
         " axes: {cv: {inertia_kgm2: 0.001, torque_limit_Nm: 1.25}, servo: {viscous_Nms: 0.007, coulomb_Nm: 0}}}"
     )
     model = nominal_parameters(config)
-    assert (model.q.mass_kg, model.p.mass_kg) == (0.05, 0.596)
+    assert (model.q.mass_kg, model.q.com_m, model.p.mass_kg) == (0.05, 0.125, 0.596)
     assert model.end_effector_mass_kg == 0.02
     assert model.gravity_m_s2 == (0.0, -5.0)
     assert model.rotor_inertia_kg_m2 == (0.001, 0.00012)
