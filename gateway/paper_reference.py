@@ -34,6 +34,10 @@ SERVO_TORQUE_NM: Final = (0.0862, -0.0859, 0.0461)
 """Table I: max, min, RMS; it fits nearly massless links only."""
 CV_TORQUE_NM: Final = (0.6107, -0.5739, 0.6043)
 """Table I: max, min, RMS."""
+CV_VELOCITY_ERROR_COUNTS_PER_S: Final = 1024.0
+"""At most, a one-sample difference too."""
+POWER_KW: Final = (3.3429, 1.5696)
+"""Drawn by the CV axis and the servo axis, measured at the amplifiers' inputs."""
 
 _LENGTHS_MM: Final = (150.0, 250.0, 300.0, 150.0)
 _PIVOT_DISTANCE_MM: Final = (250.0, 0.0)

@@ -30,9 +30,11 @@ from gateway.cli.terminal import (
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
     from gateway.bus_address import BusAddress
+    from gateway.cli.paper_demo import VirtualRunner
     from gateway.learning_store import LearningStore
     from gateway.preparation import PreparedRun
     from gateway.recording import Recording
+    from sim_drive.machine import EmulatedMachine
 
 RUN_EPILOG = """Examples:
 
@@ -50,6 +52,7 @@ DEMO_EPILOG = """Examples:
   drive-gateway demo                     vcan0 where it is up, else socketcand on 127.0.0.1
   drive-gateway demo --channel vcan1     another interface
   drive-gateway demo --cycles 3 -o /tmp/demo --json
+  drive-gateway demo --paper             the paper's measurements beside the emulated machine's, in virtual time
 """
 VirtualTimeOption = Annotated[
     bool,
@@ -139,6 +142,13 @@ def _run_on_bus(
         )
 
 
+def _paper_runner(seed: int) -> "VirtualRunner":
+    def run(prepared: "PreparedRun", cam: str, recording: Path, machine: "EmulatedMachine") -> None:
+        _run_virtually(prepared, cam, recording, seed, True, False, machine=machine)
+
+    return run
+
+
 def _run_virtually(
     prepared: "PreparedRun",
     cam: str,
@@ -147,14 +157,16 @@ def _run_virtually(
     is_overwriting: bool,
     with_frames: bool = True,
     store: "LearningStore | None" = None,
+    machine: "EmulatedMachine | None" = None,
 ) -> float:
-    """Carry out the run in virtual time; returns machine seconds per second."""
+    """Carry out the run in virtual time; returns machine seconds per second. ``machine``: not the configuration's."""
     from gateway.core import GatewayCore
     from gateway.session import StopSwitch
     from gateway.virtual_run import run_virtual
     from sim_drive.assembly import build_machine
 
-    machine = build_machine(prepared.config, seed)
+    if machine is None:
+        machine = build_machine(prepared.config, seed)
     switch = StopSwitch()
     started = time.monotonic()
     reached_s = 0.0
@@ -291,17 +303,28 @@ def demo(
         str | None, typer.Option("--channel", "-c", help="SocketCAN interface to use  [default: vcan0 where it is up]")
     ] = None,
     virtual_time: VirtualTimeOption = False,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="In virtual time, with the paper's tuning: its figures side by side.")
+    ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all that is random in the emulated machine.")] = 0,
     as_json: JsonOption = False,
 ) -> None:
     """The whole chain against an emulated machine: compile, commission, run 10 machine cycles, report."""
     from config.loading import load_config
+    from gateway.cli.paper_demo import paper_demo
+    from gateway.errors import UsageError
     from gateway.session import emulator_process
     from mechanism.cam_file import write_cam_file
 
     settings = load_config("paper")
     console = messages()
     output.mkdir(parents=True, exist_ok=True)
+    if paper:
+        if channel is not None:
+            raise UsageError("--paper runs in virtual time and takes no --channel")
+        count = settings.motion.machine_cycles if cycles is None else cycles
+        paper_demo(settings, count, output, seed, as_json, _paper_runner(seed))
+        return
     console.print(f"compiling the cam of {settings.description}", markup=False)
     prepared, cam = _prepare(settings, cycles)
     write_cam_file(output / "cam.json", prepared.cam)

@@ -1,0 +1,44 @@
+"""Named sets of gains for both axes of a machine, to be run and compared; data in ``config/gains``."""
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import yaml
+from pydantic import Field
+
+from config.loading import SHIPPED, parse_config, parse_model, read_text
+from config.schema import FeedForwardSection, GainsSection, GatewayConfig, Model
+
+
+class GainSet(Model):
+    """Gains of both axes, and what they are for."""
+
+    title: Annotated[str, Field(min_length=1, max_length=200)]
+    note: Annotated[str, Field(max_length=500)] = ""
+    master: GainsSection
+    slave: GainsSection
+
+
+class GainSets(Model):
+    """A file of ``config/gains``."""
+
+    sets: Annotated[dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")], GainSet], Field(min_length=1)]
+
+
+def load_gain_sets(name: str) -> Mapping[str, GainSet]:
+    """The shipped sets of gains for the configuration of that name. Raises ConfigError."""
+    path = SHIPPED / "gains" / f"{name}.yaml"
+    return parse_model(read_text(path), path, GainSets).sets
+
+
+def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
+    """``config`` with these gains in its emulated drives and nothing that helps the controller; its text says so too.
+
+    Raises ConfigError.
+    """
+    axes = dict(config.axes)
+    for name, own in zip(config.axis_names, (gains.master, gains.slave), strict=True):
+        emulation = axes[name].emulation.model_copy(update={"gains": own})
+        axes[name] = axes[name].model_copy(update={"emulation": emulation})
+    changed = config.model_copy(update={"axes": axes, "feed_forward": FeedForwardSection()})
+    return parse_config(yaml.safe_dump(changed.model_dump(mode="json"), sort_keys=False), config.path)
