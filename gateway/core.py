@@ -164,9 +164,14 @@ class GatewayCore:
 
     # -- commands from outside -----------------------------------------------------------------------------------
 
-    def request_stop(self) -> None:
-        """Controlled stop: on the cam if in motion, else straight back to disabled drives. May be called repeatedly."""
+    def request_stop(self, wish: Condition = Condition.OPERATOR_STOP) -> None:
+        """Stop as the guard's table says for this wish, by default on the cam; before anything is enabled, straight
+        back to disabled drives. May be called repeatedly.
+        """
         self._is_stop_requested = True
+        if self.loop.is_guarding_enabled:
+            self._guard.hold(wish, 0, 1, 1, self.master.now_ns)
+            self.loop.react()
 
     def request_quick_stop(self) -> None:
         """Quick stop on all drives."""

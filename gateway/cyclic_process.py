@@ -31,7 +31,7 @@ from gateway.cycle_bus import CycleBus, open_cycle_bus
 from gateway.cycle_host import CycleHost
 from gateway.errors import GatewayError
 from gateway.event_text import describe
-from gateway.guard import StopReason
+from gateway.guard import Condition, StopReason
 from gateway.learning_store import LearningStore, open_store
 from gateway.preparation import build_core, plan
 from gateway.ring import RingWriter, RunState, StopRequest
@@ -83,6 +83,13 @@ def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None
             raise GatewayError(f"somebody else commands this bus: {sign} is on it, is another run going on?")
 
 
+WISH_OF_REQUEST: Final = {
+    StopRequest.CONTROLLED_STOP: Condition.OPERATOR_STOP,
+    StopRequest.SIGINT: Condition.SIGINT,
+    StopRequest.SIGTERM: Condition.SIGTERM,
+}
+
+
 def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
     """Hand a stop request to the core, once: a quick stop asked for again would undo the disabling that follows it.
 
@@ -93,7 +100,7 @@ def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
     if request >= StopRequest.QUICK_STOP:
         core.request_quick_stop()
     else:
-        core.request_stop()
+        core.request_stop(WISH_OF_REQUEST[StopRequest(request)])
     return request
 
 
@@ -169,8 +176,8 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
-    def on_terminate(_number: int, _frame: FrameType | None) -> None:
-        ring.request_stop(StopRequest.CONTROLLED_STOP)
+    def on_terminate(number: int, _frame: FrameType | None) -> None:
+        ring.request_stop(StopRequest.SIGTERM if number == signal.SIGTERM else StopRequest.CONTROLLED_STOP)
 
     signal.signal(signal.SIGTERM, on_terminate)
     signal.signal(signal.SIGHUP, on_terminate)

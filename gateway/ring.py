@@ -94,8 +94,12 @@ class StopRequest(IntEnum):
 
     NONE = 0
     CONTROLLED_STOP = 1
-    """Ramp the master down on the cam."""
-    QUICK_STOP = 2
+    """An operator's: what the guard's ``operator_stop`` says, by default to ramp the master down on the cam."""
+    SIGINT = 2
+    """What the guard's ``sigint`` says."""
+    SIGTERM = 3
+    """What the guard's ``sigterm`` says."""
+    QUICK_STOP = 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -45,10 +45,14 @@ class Progress:
     """Machine cycles of the whole plan, ramps included."""
 
 
-class StopSwitch:
-    """Signals as stop requests: the first SIGINT or SIGTERM asks for a controlled stop, the second for a quick stop.
+REQUEST_OF_SIGNAL: Final = {signal.SIGINT: StopRequest.SIGINT, signal.SIGTERM: StopRequest.SIGTERM}
 
-    SIGHUP, a terminal that was closed, asks for a controlled stop however often it comes.
+
+class StopSwitch:
+    """Signals as stop requests: the first SIGINT or SIGTERM asks for what the guard's table says, the second for a
+    quick stop.
+
+    SIGHUP, a terminal that was closed, asks for an operator's stop however often it comes.
     """
 
     def __init__(self) -> None:
@@ -57,7 +61,7 @@ class StopSwitch:
     def press(self, _number: int = 0, _frame: FrameType | None = None) -> None:
         """Ask for a stop, or for a stronger one."""
         if self.request is StopRequest.NONE:
-            self.request = StopRequest.CONTROLLED_STOP
+            self.request = REQUEST_OF_SIGNAL.get(_number, StopRequest.CONTROLLED_STOP)
         elif _number != signal.SIGHUP:
             self.request = StopRequest.QUICK_STOP
 

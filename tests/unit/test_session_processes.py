@@ -48,8 +48,8 @@ class CountingCore:
     def __init__(self):
         self.calls = []
 
-    def request_stop(self):
-        self.calls.append("stop")
+    def request_stop(self, wish):
+        self.calls.append(wish.value)
 
     def request_quick_stop(self):
         self.calls.append("quick stop")
@@ -57,9 +57,19 @@ class CountingCore:
 
 def test_a_stop_request_is_handed_on_once():
     core, answered = CountingCore(), 0
-    for request in (0, 0, 1, 1, 1, 2, 2, 2, 2):
+    for request in (0, 0, StopRequest.SIGINT, StopRequest.SIGINT, 1, StopRequest.QUICK_STOP, StopRequest.QUICK_STOP):
         answered = pass_on_stop(core, request, answered)
-    assert core.calls == ["stop", "quick stop"]
+    assert core.calls == ["sigint", "quick stop"]
+
+
+def test_each_signal_asks_for_what_the_guard_says_of_it():
+    for number, request in ((signal.SIGINT, StopRequest.SIGINT), (signal.SIGTERM, StopRequest.SIGTERM)):
+        switch = StopSwitch()
+        with switch.installed():
+            signal.raise_signal(number)
+            assert switch.request is request
+            signal.raise_signal(number)
+            assert switch.request is StopRequest.QUICK_STOP
 
 
 class LateCore:

@@ -11,8 +11,9 @@ from config.conversion import closure_at_home, desired_curve, dynamics_parameter
 from config.loading import load_config, parse_config
 from config.schema import GatewayConfig
 from drivers.frame import Frame
-from drivers.node import Event
+from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
+from gateway.core import GatewayCore
 from gateway.guard import GuardTripped, StopReason
 from gateway.preparation import PreparedRun, build_core, prepare
 from gateway.sample import Phase
@@ -26,6 +27,9 @@ CV, SERVO = 1, 2
 PAPER = load_config("paper")
 CRUISE_FROM_S = 1.75
 """The paper's machine is at its speed from here on; link p then stands at 320 deg."""
+
+
+TWO_COUNTS_RAD = 2.0 * math.tau / 4096
 
 
 def at_theta2(degrees: float) -> float:
@@ -58,7 +62,7 @@ class Strain:
     shaft_torques_Nm: tuple[float, float]
     """Peak of what motor, brake and friction together put on each shaft."""
     rest_s: float
-    """From the instant to the last motion of either axis."""
+    """From the instant until both axes are, for good, within two counts of where they are at the end."""
 
 
 class Guarded:
@@ -73,7 +77,9 @@ class Guarded:
         is_brakeless: bool = False,
         bus_faults: object = None,
         trace: Callable[[int, Frame], None] | None = None,
+        host: Callable[[GatewayCore], Node] | None = None,
     ) -> None:
+        """``host``: what drives the gateway's core on the bus in its place."""
         self.config = config
         self.prepared = prepared_run(config.text, cycles)
         self.machine = build_machine(config, record_ticks=200_000)
@@ -83,7 +89,7 @@ class Guarded:
         self.core = build_core(config, self.prepared.cam.profile, self.prepared.plan, self)
         self.events: list[Event] = []
         self.bus = VirtualBus(
-            [self.core, self.injector],
+            [self.core if host is None else host(self.core), self.injector],
             config.bus.bit_rate,
             seed,
             trace,
@@ -137,14 +143,54 @@ class Guarded:
         closure = self.machine.plant.parameters.closure
         sines = np.abs(five_bar.transmission_sines(angles[:, 0], angles[:, 1], closure)[:, 0])
         cam = self.prepared.cam.profile.at_many(angles[:, 0])[:, 0]
-        moved = np.abs(np.diff(angles, axis=0)).max(axis=1) > 2e-6
-        rest = float((np.flatnonzero(moved)[-1] + 1) * tick_s) if moved.any() else 0.0
+        away = np.abs(angles - angles[-1]).max(axis=1) > TWO_COUNTS_RAD
+        rest = float((np.flatnonzero(away)[-1] + 1) * tick_s) if away.any() else 0.0
         return Strain(
             float("nan") if not np.isfinite(sines).all() else float(sines.min()),
             float(np.abs(angles[:, 1] - cam).max()),
             shaft_torques(angles, tick_s, self.config),
             rest,
         )
+
+
+class Silenced:
+    """The gateway is heard no more from an instant on, as when its process has been killed."""
+
+    def __init__(self, from_s: float) -> None:
+        self.from_ns = round(from_s * SECOND)
+
+    def delays_ns(self, sender: int, frame: Frame, now_ns: int, source: object) -> tuple[int, ...]:
+        return () if sender == 0 and now_ns >= self.from_ns else (0,)
+
+
+class Host:
+    """Drives the core as a host that is away once, for a span, or late with everything it sends for another one."""
+
+    def __init__(
+        self, core: GatewayCore, away: tuple[float, float] = (0.0, 0.0), late: tuple[float, float] = (0.0, 0.0)
+    ):
+        self.core = core
+        self.away = tuple(round(at_s * SECOND) for at_s in away)
+        self.late = tuple(round(at_s * SECOND) for at_s in late)
+        self.take_frames = core.take_frames
+        self.take_events = core.take_events
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        if not self.away[0] <= now_ns < self.away[1]:
+            self.core.receive(frame, now_ns)
+            self._be_late(now_ns)
+
+    def next_wake_ns(self) -> int | None:
+        due_ns = self.core.next_wake_ns()
+        return self.away[1] if due_ns is not None and self.away[0] <= due_ns < self.away[1] else due_ns
+
+    def wake(self, now_ns: int) -> None:
+        self.core.wake(now_ns)
+        self._be_late(now_ns)
+
+    def _be_late(self, now_ns: int) -> None:
+        if self.late[0] <= now_ns < self.late[1]:
+            self.core.loop.sent(now_ns + self.core.loop.period_ns)
 
 
 def shaft_torques(angles: np.ndarray, tick_s: float, config: GatewayConfig) -> tuple[float, float]:
