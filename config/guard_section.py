@@ -122,7 +122,7 @@ class GuardSection(Model):
     """The torque actual value, either way."""
     end_effector_error: LengthCondition = LengthCondition(limit_mm=50.0, persistence_cycles=5, reaction=_QUICK)
     """Distance of the end effector from where the demand has it."""
-    frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, reaction=_DISABLE)
+    frozen_actual: AngleCondition = AngleCondition(limit_deg=0.5, reaction=_DISABLE)
     """The demand has gone so far while the actual value has not changed by a single count."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
     axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)
@@ -136,8 +136,8 @@ class GuardSection(Model):
     heartbeat_lost: ConditionSection = ConditionSection(reaction=_QUICK)
     bus_off: ConditionSection = ConditionSection(persistence_cycles=20, reaction=_QUICK)
     """No drive is heard at all, or the gateway's own controller has left the bus."""
-    sync_lost: CyclesCondition = CyclesCondition(limit_cycles=10, reaction=_CONTROLLED)
-    """So many SYNCs in a row have not been sent, as after a host that was away."""
+    sync_lost: CyclesCondition = CyclesCondition(limit_cycles=5, reaction=_QUICK)
+    """So many SYNCs in a row have not been sent, as after a host that was away: the drives stand meanwhile."""
     operator_stop: StopSection = StopSection()
     sigint: StopSection = StopSection()
     """The first SIGINT; a second one is a quick stop in any case."""
