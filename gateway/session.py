@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +45,10 @@ class Progress:
     """Machine cycles of the whole plan, ramps included."""
 
 
-REQUEST_OF_SIGNAL: Final = {signal.SIGINT: StopRequest.SIGINT, signal.SIGTERM: StopRequest.SIGTERM}
+REQUEST_OF_SIGNAL: Final[Mapping[int, StopRequest]] = {
+    signal.SIGINT: StopRequest.SIGINT,
+    signal.SIGTERM: StopRequest.SIGTERM,
+}
 
 
 class StopSwitch:
@@ -56,7 +59,7 @@ class StopSwitch:
     """
 
     def __init__(self) -> None:
-        self.request = StopRequest.NONE
+        self.request: StopRequest = StopRequest.NONE
 
     def press(self, _number: int = 0, _frame: FrameType | None = None) -> None:
         """Ask for a stop, or for a stronger one."""
