@@ -481,8 +481,8 @@ def closed_loop_of(config: GatewayConfig, seed: int = 0) -> ClosedLoop:
     return ClosedLoop(
         plant=PlantArguments(*plant.kernel_arguments),
         axes=machine.axes,
-        gains=[drive.gains for drive in machine.drives],
-        torque_limits_Nm=[(drive.torque_limit_Nm, drive.negative_torque_limit_Nm) for drive in machine.drives],
+        gains=[axis.gains for axis in machine.drive_axes],
+        torque_limits_Nm=[(axis.torque_limit_Nm, axis.negative_torque_limit_Nm) for axis in machine.drive_axes],
         home_rad=(plant.angle(0), plant.angle(1)),
         cycle_s=config.cycle_s,
         seed=seed,

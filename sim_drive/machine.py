@@ -298,6 +298,7 @@ class EmulatedMachine:
         "_tick_ns",
         "_torques",
         "axes",
+        "drive_axes",
         "drives",
         "plant",
         "records",
@@ -327,9 +328,9 @@ class EmulatedMachine:
         self.plant: Final = plant
         self.axes: Final = tuple(axes)
         self.records: Final = deque[TickRecord](maxlen=record_ticks)
-        drive_axes = [axis for drive in self.drives for axis in drive.axes]
+        self.drive_axes: Final = tuple(axis for drive in self.drives for axis in drive.axes)
         self._motors: Final = tuple(
-            _Motor(index, *pair) for index, pair in enumerate(zip(drive_axes, axes, strict=True))
+            _Motor(index, *pair) for index, pair in enumerate(zip(self.drive_axes, axes, strict=True))
         )
         motors = iter(self._motors)
         self._stations: Final = tuple(_Station(drive, [next(motors) for _ in drive.axes]) for drive in self.drives)
