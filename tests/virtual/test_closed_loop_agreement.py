@@ -66,14 +66,14 @@ def copy_state(machine, loop):
     loop._clock[fast._TICK] = machine._tick
     loop._clock[fast._TICK_NS] = machine._tick_ns
     for number, motor in enumerate(machine._motors):
-        memory, servo, demand = loop._memory[number], motor.servo, motor.drive.axis.demand
+        memory, servo, demand = loop._memory[number], motor.servo, motor.drive_axis.demand
         memory[fast._ERROR_SUM] = servo._error_sum
         memory[fast._ERROR_BEFORE] = servo._error_before
         memory[fast._POSITION_BEFORE] = servo._position_before
         memory[fast._DEMAND_BEFORE] = servo._demand_before
         memory[fast._COMMAND] = machine._torques[number]
         memory[fast._DELAYED] = motor.delayed_torque
-        memory[fast._TORQUE_OFFSET] = motor.drive.torque_offset_Nm
+        memory[fast._TORQUE_OFFSET] = motor.drive_axis.torque_offset_Nm
         memory[fast._LINE_POSITION] = demand.position
         memory[fast._LINE_VELOCITY] = demand.velocity
         memory[fast._LINE_DURATION] = demand.duration_s
