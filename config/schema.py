@@ -7,17 +7,15 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
+from config.bus_budget import LATEST_TPDO, MAX_BUS_LOAD, BusBudget, bus_budget
 from config.guard_section import GuardSection
 from config.model import AxisName, Model, NotNegative, Point, Positive
 from config.quirks import Quirk
 from config.torque_sections import FeedForwardSection, LearningSection
-from drivers.frame import WORST_CASE_BITS
 from drivers.nmt import MAX_NODE_ID
 
-CYCLIC_FRAME_BYTES: Final = 8
-"""RPDO and TPDO each carry a word, a position and a torque."""
-MAX_BUS_LOAD: Final = 0.9
-"""Share of the cycle that SYNC and PDOs may take at worst-case stuffing; the rest is SDO, heartbeats and EMCY."""
+VIRTUAL_BIT_RATE: Final = 1_000_000_000
+"""What a channel without a bit rate has in virtual time."""
 
 Millimetres = Annotated[float, Field(ge=1.0, le=10_000.0)]
 
@@ -249,7 +247,11 @@ class BusSection(Model):
     host: Annotated[str, Field(min_length=1, max_length=253)] = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 29536
     bit_rate: Annotated[int, Field(ge=10_000, le=1_000_000)] = 1_000_000
+    is_virtual: bool = False
+    """The channel has no bit rate (vcan, loopback): the budget is told, and a run on a real bus alone is held to it."""
     cycle_us: Annotated[int, Field(ge=200, le=1_000_000)] = 1000
+    sdo_frames_a_cycle: Annotated[int, Field(ge=1, le=100)] = 2
+    """Reserve for SDO while the cycle runs, requests and responses together; no more is sent."""
     sync_source: SyncSource = SyncSource.AUTO
     processor: Annotated[int, Field(ge=0, le=4095)] | None = None
     """Processor that the cyclic loop is bound to; null: an isolated one if there is one, else none."""
@@ -266,11 +268,6 @@ class BusSection(Model):
         while value % 10 == 0:
             value, exponent = value // 10, exponent + 1
         return (value, exponent) if value <= 255 else None
-
-    def load(self, axes: int) -> float:
-        """Share of the cycle that SYNC and two PDOs an axis take at worst-case bit stuffing."""
-        bits = WORST_CASE_BITS[0] + 2 * axes * WORST_CASE_BITS[CYCLIC_FRAME_BYTES]
-        return bits / self.bit_rate / (self.cycle_us * 1e-6)
 
 
 class EmulatorSection(Model):
@@ -324,6 +321,22 @@ class GatewayConfig(Model):
         return self.bus.cycle_us * 1e-6
 
     @property
+    def budget(self) -> BusBudget:
+        """What the configuration puts on the bus."""
+        bus = self.bus
+        return bus_budget(len(self.axes), bus.cycle_us, bus.bit_rate, bus.heartbeat_ms, bus.sdo_frames_a_cycle)
+
+    @property
+    def tpdo_deadline_us(self) -> float:
+        """How long after SYNC the TPDOs are waited for."""
+        return LATEST_TPDO * self.bus.cycle_us if self.bus.is_virtual else self.budget.tpdo_deadline_us
+
+    @property
+    def wire_bit_rate(self) -> int:
+        """Bit rate of the bus in virtual time."""
+        return VIRTUAL_BIT_RATE if self.bus.is_virtual else self.bus.bit_rate
+
+    @property
     def speed_rad_per_s(self) -> float:
         """Speed of the CV axis."""
         return self.motion.speed_rpm * 2.0 * math.pi / 60.0
@@ -362,11 +375,13 @@ class GatewayConfig(Model):
                 if name not in self.axes:
                     known = " and ".join(self.axes)
                     raise ValueError(f"{section}.axes.{name}: there is no such axis, they are {known}")
-        load = self.bus.load(len(self.axes))
-        if load > MAX_BUS_LOAD:
+        budget = self.budget
+        if not (budget.is_within_bound or self.bus.is_virtual):
             raise ValueError(
                 f"bus.cycle_us: {self.bus.cycle_us} us is too short for {len(self.axes)} axes at "
-                f"{self.bus.bit_rate} bit/s, SYNC and PDOs would take {load:.0%} of it (bound {MAX_BUS_LOAD:.0%})"
+                f"{self.bus.bit_rate} bit/s, SYNC, PDOs, heartbeats and the SDO reserve would take {budget.load:.0%} "
+                f"of it (bound {MAX_BUS_LOAD:.0%}), {budget.shortest_cycle_us} us would fit; on a channel without a "
+                "bit rate say is_virtual: true"
             )
         return self
 

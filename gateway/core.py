@@ -30,6 +30,7 @@ from gateway.guard import Condition, Guard, StopReason
 from gateway.learning import LearnedTorque
 from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.sample import Phase
+from gateway.sdo_pacing import SdoPacing
 from mechanism.motion import MasterPlan
 
 NS_PER_S: Final = 1_000_000_000
@@ -70,8 +71,12 @@ class GatewayCore:
         plan: MasterPlan,
         guard: Guard,
         is_homing_again: bool = False,
+        sdo_frames_a_cycle: int = 2,
     ) -> None:
-        """``is_homing_again``: home the axes where they stand even if their drives are homed already."""
+        """``is_homing_again``: home the axes where they stand even if their drives are homed already.
+
+        ``sdo_frames_a_cycle``: requests and responses that may be on the bus in each cycle.
+        """
         self.loop = loop
         self.master = master
         self.is_done = False
@@ -85,6 +90,7 @@ class GatewayCore:
         self._plan = plan
         self._guard = guard
         self._is_homing_again = is_homing_again
+        self._sdo_pacing = SdoPacing(sdo_frames_a_cycle)
         self._is_stop_requested = False
         self._is_watching_nodes = False
         """Set once the drives are configured: one that restarts or falls silent after that is not what it was."""
@@ -141,11 +147,12 @@ class GatewayCore:
 
     def take_frames(self) -> list[Frame]:
         """Frames to send: the cycle's first, so that SDO traffic never delays a demand."""
-        frames = self.loop.outbox
+        loop = self.loop
+        frames = loop.outbox
         if frames:
-            self.loop.outbox = []
-        if self.master.outbox:
-            frames = frames + self.master.outbox
+            loop.outbox = []
+        if self.master.outbox or self._sdo_pacing.is_holding:
+            frames = frames + self._sdo_pacing.release(self.master.outbox, loop.cycle if loop.is_running else None)
             self.master.outbox = []
         return frames
 

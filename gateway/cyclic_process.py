@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from config.bus_budget import LATEST_TPDO
 from config.loading import parse_config
 from config.schema import GatewayConfig
 from drivers.cia402 import COMMAND_QUICK_STOP
@@ -24,6 +25,7 @@ from drivers.node import Event
 from drivers.ports import Port
 from drivers.real_time import RealTimeSetting, try_realtime
 from gateway.bus_address import BusAddress
+from gateway.bus_budget import has_wire
 from gateway.child_process import end_with
 from gateway.core import GatewayCore
 from gateway.cycle import RPDO_LAYOUT, SYNC_FRAME
@@ -165,6 +167,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     config = parse_config(job.config_text, Path(job.config_path))
     profile = parse_cam_file(job.cam_text, "cam of the job").cam.profile
     store = open_store(config, profile, None if job.learn is None else Path(job.learn))
+    address = BusAddress(job.interface, job.channel, job.host, job.port, job.bit_rate)
     core = build_core(
         config,
         profile,
@@ -173,6 +176,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         time.thread_time_ns,
         job.is_homing_again,
         None if store is None else store.learning(),
+        None if has_wire(address) else LATEST_TPDO * config.bus.cycle_us,
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
@@ -195,7 +199,6 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         ring.beat(time.monotonic_ns())
         answered = pass_on_stop(core, ring.stop_request(), answered)
 
-    address = BusAddress(job.interface, job.channel, job.host, job.port, job.bit_rate)
     bus: CycleBus | None = None
     stopped_by = StopReason.BUS_LOST
     try:

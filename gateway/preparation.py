@@ -251,10 +251,12 @@ def build_core(
     cpu_clock: Callable[[], int] | None = None,
     is_homing_again: bool = False,
     learning: Learning | None = None,
+    tpdo_deadline_us: float | None = None,
 ) -> GatewayCore:
     """Put the gateway's parts together; see ``gateway.core``.
 
     ``learning``: what has been learned before and is to be gone on with; None leaves it to the configuration.
+    ``tpdo_deadline_us``: how long after SYNC the TPDOs are waited for; None is what the bus budget leaves.
     """
     channels = [
         AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.following_error_counts)
@@ -274,7 +276,10 @@ def build_core(
         config.cycle_s,
         config.ordered_axes[0].limits.acceleration_rad_per_s2 if deceleration is None else deceleration,
     )
-    loop = CyclicLoop(channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock, None, watch, coupled_stop)
+    deadline_ns = round((config.tpdo_deadline_us if tpdo_deadline_us is None else tpdo_deadline_us) * NS_PER_US)
+    loop = CyclicLoop(
+        channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock, deadline_ns, watch, coupled_stop
+    )
     loop.sync_gap_limit = config.guard.sync_lost.limit_cycles
     units = (channels[0].units, channels[1].units)
     if learning is None and config.learning.enabled:
@@ -288,5 +293,13 @@ def build_core(
         build_torque_offsets(config, profile, units, learning),
     )
     return GatewayCore(
-        setups, network_settings(config), build_master(config), loop, demand, run_plan, guard, is_homing_again
+        setups,
+        network_settings(config),
+        build_master(config),
+        loop,
+        demand,
+        run_plan,
+        guard,
+        is_homing_again,
+        config.bus.sdo_frames_a_cycle,
     )

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from drivers.errors import BusError
 from gateway.bus_address import BusAddress
+from gateway.bus_budget import require_budget
 from gateway.cyclic_process import CyclicJob
 from gateway.errors import GatewayError
 from gateway.preparation import PreparedRun
@@ -115,6 +116,7 @@ def run_realtime(
     config = prepared.config
     constants = RunConstants.from_config(config, prepared.cam.closure)
     failures: list[str] = []
+    require_budget(config, address)
     # A bus that is not there is told before a recording is begun.
     address.open().close()
     start_ns = time.monotonic_ns()

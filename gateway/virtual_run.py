@@ -54,7 +54,7 @@ def run_virtual(
             sink.append_event(event.at_ns, kind, text, source=source, **data)
 
         bus = VirtualBus(
-            [core, machine], config.bus.bit_rate, seed, sink.trace if with_frames else None, on_event=on_event
+            [core, machine], config.wire_bit_rate, seed, sink.trace if with_frames else None, on_event=on_event
         )
         limit_ns = round((prepared.plan.duration_s + MAX_EXTRA_S) * NS_PER_S)
         while not core.is_done and bus.now_ns < limit_ns:

@@ -45,12 +45,12 @@ DOWNLOAD_EPILOG = """Examples, with an emulated machine in another terminal (sim
 def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
     """Check a configuration: its keys, the cam against every limit, the bus budget. Nothing is opened or moved."""
     from config.loading import load_config
+    from gateway.bus_budget import budget_json, budget_table
     from gateway.preparation import prepare
 
     settings = load_config(config)
     prepared = prepare(settings, is_strict=False)
     figures = prepared.cam.report.figures()
-    load = settings.bus.load(len(settings.axes))
     problems = [str(violation) for violation in prepared.violations]
     if as_json:
         print_json(
@@ -60,11 +60,7 @@ def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
                 "is_runnable": not problems,
                 "problems": problems,
                 "figures": figures,
-                "bus": {
-                    "cycle_s": settings.cycle_s,
-                    "bit_rate": settings.bus.bit_rate,
-                    "cyclic_load": load,
-                },
+                "bus": budget_json(settings),
                 "run": {
                     "duration_s": prepared.plan.duration_s,
                     "machine_cycles": settings.motion.machine_cycles,
@@ -125,11 +121,11 @@ def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
                 "",
             ),
             ("greatest step of the demand a bus cycle", f"{report.step_counts.value:.1f}", "", "counts"),
-            ("bus load of the cycle, worst case", f"{load:.1%}", "90%", "of the bus"),
         ]
         for row in rows:
             table.add_row(*row)
         console.print(table)
+        console.print(budget_table(settings))
         console.print(
             f"run: {prepared.plan.duration_s:.2f} s, of which {settings.motion.machine_cycles} machine cycles or a "
             f"little more at constant speed ({prepared.plan.cruise_end_s - prepared.plan.cruise_start_s:.2f} s)"
