@@ -153,7 +153,8 @@ def test_a_missing_sync_is_flagged_and_after_three_the_loop_sends_it_itself():
     assert bench.loop.next_wake_ns() == wakes[-1] + DEADLINE
     bench.tpdo(0, wakes[-1] + 1000)
     bench.tpdo(1, wakes[-1] + 2000)
-    assert bench.take() == [(0x201, 2), (0x202, -2)]
+    assert bench.loop.phase is Phase.QUICK_STOP, "the guard takes it for a lost SYNC"
+    assert bench.take() == [(0x201, 1), (0x202, -1)]
     bench.loop.wake(wakes[-1] + MS)
     assert [row["flags"] for row in bench.sink.rows] == [SampleFlag.SYNC_LOST, SampleFlag.SYNC_LOST]
     assert not bench.loop.receive_sync(10 * MS), "whoever sends SYNC now is not this loop's pace"
