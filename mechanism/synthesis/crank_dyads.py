@@ -18,7 +18,10 @@ from mechanism.synthesis.task import VARIABLE_COUNT, SynthesisTask, Timing, Vari
 
 Float = NDArray[np.float64]
 
-_STARTS: Final = 12
+_STARTS: Final = 8
+_ITERATIONS: Final = 60
+_TRACED: Final = 1e-9
+"""A curve that a crank dyad misses by less than so much of its size has been traced by one."""
 _KEPT: Final = 6
 _SEEDED_SHARE: Final = 0.25
 CRANK_VARIABLES: Final = (Variable.P, Variable.Q, Variable.CV_PIVOT_X, Variable.CV_PIVOT_Y)
@@ -74,7 +77,7 @@ def refine_crank(task: SynthesisTask, crank: Float) -> tuple[Float, float, int]:
         xtol=1e-15,
         ftol=1e-15,
         gtol=1e-15,
-        max_nfev=200,
+        max_nfev=_ITERATIONS,
     )
     return whole(solution.x), 2.0 * float(solution.cost), int(solution.nfev)
 
@@ -111,7 +114,10 @@ def suitable_cranks(task: SynthesisTask, random: np.random.Generator) -> tuple[l
     starts = [random.uniform(lower, upper) for _ in range(_STARTS)]
     algebraic = algebraic_crank(task)
     if algebraic is not None:
-        starts.insert(0, np.clip(algebraic, lower, upper))
+        inside = np.clip(algebraic, lower, upper)
+        if float(np.max(np.abs(radial_errors(task, inside)))) < _TRACED * task.size_m:
+            return [refine_crank(task, inside)[0]], _ITERATIONS
+        starts.insert(0, inside)
     found: list[tuple[float, Float]] = []
     evaluations = 0
     for start in starts:

@@ -56,7 +56,7 @@ class Term(Enum):
     POWER: mean over the cycle of what both motors deliver (what flows back is lost), W.
     SERVO_VELOCITY, SERVO_ACCELERATION: greatest abs value, rad/s and rad/s^2, at the task's speed.
     KEEP_OUT: length of links inside keep-out zones, summed over the positions, m.
-    TIMING: m^3, m the number of steps by which theta2 does not rise, or does not make one turn (free timing only).
+    TIMING: m^3, m the number of steps by which theta2 does not rise, or rises too far for a curve (free timing only).
     """
 
     STRUCTURAL_ERROR = "structural error"

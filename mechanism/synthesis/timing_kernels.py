@@ -20,6 +20,7 @@ from mechanism.synthesis.tracking_kernels import (
     LEFT,
     RIGHT,
     SIN2,
+    STEP,
     THETA2,
     X,
     Y,
@@ -28,6 +29,11 @@ from mechanism.synthesis.tracking_kernels import (
 )
 
 Float = NDArray[np.float64]
+
+# As `mechanism.curve` holds its curves to, less a hair, since its median may lie between two steps.
+_GREATEST_GAP: Final = tau / 3.0
+_GREATEST_RATIO: Final = 9.0
+_LEAST_BOUND: Final = tau / 360.0
 
 ALWAYS_BEHIND: Final = 0
 IN_TURN: Final = 2
@@ -79,7 +85,7 @@ def _is_behind(i: int, count: int, way: int, nearest: int, farthest: int) -> boo
 
 @kernel
 def _take(rows: Float, count: int, way: int, nearest: int, farthest: int) -> tuple[float, float]:
-    """Fill theta2 (unwrapped) one of the ways; returns how many steps do not rise (1 if not one turn), and the sum of
+    """Fill theta2 (unwrapped) one of the ways; returns how many steps do not rise or are too wide, and the sum of
     the squared steps.
     """
     turned = 0.0
@@ -98,14 +104,29 @@ def _take(rows: Float, count: int, way: int, nearest: int, farthest: int) -> tup
                 step += tau
             if step <= 1e-9:
                 faults += 1.0
+            rows[STEP + k - 1] = step
             turned += step
             squares += step * step
             if k < count:
                 rows[THETA2 + i] = rows[THETA2] + turned
         before = angle
-    if abs(turned - tau) > 1e-6 and faults == 0.0:
-        faults = 1.0
+    if abs(turned - tau) > 1e-6:
+        faults = max(faults, 1.0)
+    elif faults == 0.0:
+        faults = _gaps(rows, count)
     return faults, squares
+
+
+@kernel
+def _gaps(rows: Float, count: int) -> float:
+    """How many steps are too wide for a `DesiredCurve` to be taken for a whole revolution."""
+    middle = np.sort(rows[STEP : STEP + count])[count // 2]
+    bound = min(_GREATEST_GAP, max(_GREATEST_RATIO * middle, _LEAST_BOUND))
+    gaps = 0.0
+    for i in range(count):
+        if rows[STEP + i] > bound:
+            gaps += 1.0
+    return gaps
 
 
 @kernel
