@@ -26,13 +26,12 @@ Float = NDArray[np.float64]
 WORST: Final = 1e6
 """What stands for torque and power where a mechanism cannot be driven; finite, so that weighted sums stay numbers."""
 
-# Layout of the machine array.
+# Layout of the machine array; the tail is that of the dynamics' own array, and the velocity of Coulomb friction.
 _DENSITY: Final = 0
-_END_MASS: Final = 4
-_END_EFFECTOR: Final = 8
-_TAIL: Final = 8
-_COULOMB_VELOCITY: Final = 17
-MACHINE_COUNT: Final = 18
+_WIDTH: Final = 4
+_END_MASS: Final = 8
+_TAIL: Final = 12
+MACHINE_COUNT: Final = 22
 
 _LINK_PARAMETERS: Final = 8
 _LINK_SIZE: Final = 4
@@ -54,11 +53,13 @@ def fill_dynamics(variables: Float, machine: Float, parameters: Float) -> None:
         end = machine[_END_MASS + link]
         mass = bar + end
         com = (0.5 * bar + end) * length / mass if mass > 0.0 else 0.0
+        width = machine[_WIDTH + link]
+        about_first_joint = (bar / 3.0 + end) * length * length + bar * width * width / 12.0
         first = _LINK_PARAMETERS + _LINK_SIZE * link
         parameters[first] = mass
         parameters[first + 1] = com
         parameters[first + 2] = 0.0
-        parameters[first + 3] = max((bar / 3.0 + end) * length * length - mass * com * com, 0.0)
+        parameters[first + 3] = max(about_first_joint - mass * com * com, 0.0)
     for k in range(PARAMETER_COUNT - _END_EFFECTOR_MASS):
         parameters[_END_EFFECTOR_MASS + k] = machine[_TAIL + k]
 

@@ -16,6 +16,7 @@ class MachineModel:
     """
 
     linear_density_kg_per_m: tuple[float, float, float, float] = (3.14, 0.162, 0.162, 0.162)
+    width_m: tuple[float, float, float, float] = (0.040, 0.015, 0.015, 0.015)
     end_mass_kg: tuple[float, float, float, float] = (0.125, 0.0, 0.0, 0.012)
     end_effector_mass_kg: float = 0.012
     rotor_inertia_kg_m2: tuple[float, float] = (1.2e-4, 1.2e-4)
@@ -27,6 +28,7 @@ class MachineModel:
     def __post_init__(self) -> None:
         for name, values in (
             ("linear_density_kg_per_m", self.linear_density_kg_per_m),
+            ("width_m", self.width_m),
             ("end_mass_kg", self.end_mass_kg),
         ):
             if len(values) != 4 or not finite(*values) or min(values) < 0.0:
@@ -42,7 +44,7 @@ class MachineModel:
         end = self.end_mass_kg[index]
         mass = bar + end
         com = (0.5 * bar + end) * length_m / mass if mass > 0.0 else 0.0
-        about_first_joint = (bar / 3.0 + end) * length_m * length_m
+        about_first_joint = (bar / 3.0 + end) * length_m * length_m + bar * self.width_m[index] ** 2 / 12.0
         return LinkParameters(mass, com, 0.0, max(about_first_joint - mass * com * com, 0.0))
 
     def dynamics(self, five_bar: FiveBar) -> DynamicsParameters:

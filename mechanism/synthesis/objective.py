@@ -75,6 +75,7 @@ def _machine(model: MachineModel) -> Float:
     return np.array(
         [
             *model.linear_density_kg_per_m,
+            *model.width_m,
             *model.end_mass_kg,
             model.end_effector_mass_kg,
             *model.rotor_inertia_kg_m2,
