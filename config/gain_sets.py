@@ -7,7 +7,8 @@ import yaml
 from pydantic import Field
 
 from config.loading import SHIPPED, parse_config, parse_model, read_text
-from config.schema import FeedForwardSection, GainsSection, GatewayConfig, Model
+from config.schema import GainsSection, GatewayConfig, Model
+from config.torque_sections import FeedForwardSection, LearningSection
 
 
 class GainSet(Model):
@@ -40,5 +41,6 @@ def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
     for name, own in zip(config.axis_names, (gains.master, gains.slave), strict=True):
         emulation = axes[name].emulation.model_copy(update={"gains": own})
         axes[name] = axes[name].model_copy(update={"emulation": emulation})
-    changed = config.model_copy(update={"axes": axes, "feed_forward": FeedForwardSection()})
+    unaided = {"feed_forward": FeedForwardSection(), "learning": LearningSection()}
+    changed = config.model_copy(update={"axes": axes, **unaided})
     return parse_config(yaml.safe_dump(changed.model_dump(mode="json"), sort_keys=False), config.path)
