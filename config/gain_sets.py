@@ -1,7 +1,7 @@
 """Named sets of gains for both axes of a machine, to be run and compared; data in ``config/gains``."""
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Final
 
 import yaml
 from pydantic import Field
@@ -9,6 +9,9 @@ from pydantic import Field
 from config.loading import SHIPPED, parse_config, parse_model, read_text
 from config.schema import GainsSection, GatewayConfig, Model
 from config.torque_sections import FeedForwardSection, LearningSection
+
+LOOSE_FROZEN_DEG: Final = 3.0
+"""How far the demand of an axis with such gains may go while the axis stands."""
 
 
 class GainSet(Model):
@@ -35,12 +38,19 @@ def load_gain_sets(name: str) -> Mapping[str, GainSet]:
 def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
     """``config`` with these gains in its emulated drives and nothing that helps the controller; its text says so too.
 
+    The guard's limit for a frozen actual value is ``LOOSE_FROZEN_DEG`` at least.
+
     Raises ConfigError.
     """
     axes = dict(config.axes)
     for name, own in zip(config.axis_names, (gains.master, gains.slave), strict=True):
         emulation = axes[name].emulation.model_copy(update={"gains": own})
         axes[name] = axes[name].model_copy(update={"emulation": emulation})
+    # A loose axis stands in dry friction at its turning points while the demand goes on by more than a tight one would.
+    frozen = config.guard.frozen_actual
+    wide = frozen.model_copy(update={"limit_deg": max(frozen.limit_deg, LOOSE_FROZEN_DEG)})
     unaided = {"feed_forward": FeedForwardSection(), "learning": LearningSection()}
-    changed = config.model_copy(update={"axes": axes, **unaided})
+    changed = config.model_copy(
+        update={"axes": axes, "guard": config.guard.model_copy(update={"frozen_actual": wide}), **unaided}
+    )
     return parse_config(yaml.safe_dump(changed.model_dump(mode="json"), sort_keys=False), config.path)

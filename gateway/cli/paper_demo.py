@@ -61,6 +61,7 @@ def _run_tuning(
     config: "GatewayConfig", name: str, gains: "GainSet", cycles: int, recording: Path, seed: int, run: VirtualRunner
 ) -> "TunedRun":
     from config.gain_sets import with_gain_set
+    from gateway.errors import GatewayError
     from gateway.paper_comparison import TunedRun
     from gateway.paper_figures import reproduce
     from gateway.preparation import prepare
@@ -79,7 +80,10 @@ def _run_tuning(
     full_turn = 2.0 * np.pi
     first = int(np.ceil(plan.at(plan.cruise_start_s)[0] / full_turn - 1e-9)) + 1
     last = int(np.floor(plan.at(plan.cruise_end_s)[0] / full_turn + 1e-9))
-    window = ticks.between(float(first), float(max(last, first + 1)))
+    last = max(last, first + 1)
+    if ticks.revolutions[-1] < last:
+        raise GatewayError(f"the run with the gains {name!r} was stopped early, see the events in {recording}")
+    window = ticks.between(float(first), float(last))
     return TunedRun(
         name=name,
         title=gains.title,
