@@ -201,13 +201,21 @@ def margins_of(transfer: Complex, frequencies_hz: Float, theta2: Float) -> Margi
     loops = (*alone, *_characteristic_loci(l11 + l22, l11 * l22 - cross))
     gains = [_gain_margin(loop, frequencies_hz, degrees) for loop in loops]
     phases = [_phase_margin(loop, frequencies_hz, degrees) for loop in alone]
-    peaks = 1.0 / np.linalg.svd(np.eye(2) + transfer, compute_uv=False)[..., -1]
+    peaks = _sensitivity(l11, l12, l21, l22)
     at, k = np.unravel_index(int(np.argmax(peaks)), peaks.shape)
     return Margins(
         min(gains, key=lambda margin: margin.value),
         min(phases, key=lambda margin: margin.value),
         Margin(float(peaks[at, k]), float(degrees[at]), float(frequencies_hz[k])),
     )
+
+
+def _sensitivity(l11: Complex, l12: Complex, l21: Complex, l22: Complex) -> Float:
+    """Greatest singular value of (I + L)^-1, in closed form: that of I + L over its determinant."""
+    determinant = np.abs((1.0 + l11) * (1.0 + l22) - l12 * l21)
+    square = np.abs(1.0 + l11) ** 2 + np.abs(1.0 + l22) ** 2 + np.abs(l12) ** 2 + np.abs(l21) ** 2
+    root = np.sqrt(np.maximum(square * square - 4.0 * determinant * determinant, 0.0))
+    return np.sqrt(0.5 * (square + root)) / determinant
 
 
 def _crossings(values: Float) -> tuple[Any, Any, Float]:
