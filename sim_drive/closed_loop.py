@@ -12,7 +12,7 @@ Kernels may call `advance_to_sync`, `apply_set_points` and `simulate`; Python us
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor
+from math import floor, sin
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -39,7 +39,8 @@ _ROUNDS_DIFFERENCE: Final = 5
 _OUTPUT_DELAY: Final = 6
 _NM_PER_PERMILLE: Final = 7
 _VOLT_NM: Final = 8
-_SETTING_COUNT: Final = 9
+_ECCENTRICITY: Final = 9
+_ECCENTRICITY_RAD: Final = 10
 # Memory of an axis: its controller, its resolver, the commands under way, and the line that its demand follows.
 _ERROR_SUM: Final = 0
 _ERROR_BEFORE: Final = 1
@@ -74,6 +75,16 @@ class PlantArguments(NamedTuple):
     singular_sine: float
     step_s: float
     substeps: int
+
+
+@kernel
+def _resolver(settings: Float, memory: Float, axis: int, angle: float) -> float:
+    """Whole counts that the resolver shows at an angle (rad)."""
+    reading = angle * settings[axis, _COUNTS_PER_RAD] + memory[axis, _NOISE] + 0.5
+    eccentricity: float = settings[axis, _ECCENTRICITY]
+    if eccentricity != 0.0:
+        reading += eccentricity * sin(angle - settings[axis, _ECCENTRICITY_RAD])
+    return floor(reading)
 
 
 @kernel
@@ -167,7 +178,7 @@ def advance_to_sync(
         for axis in range(_AXES):
             if row < noise.shape[0]:
                 memory[axis, _NOISE] = noise[row, axis]
-            counts = floor(plant_state[axis] * settings[axis, _COUNTS_PER_RAD] + memory[axis, _NOISE] + 0.5)
+            counts = _resolver(settings, memory, axis, plant_state[axis])
             demand = _demand_at(memory, clock, axis, now_ns)
             command = _control(settings, gains, memory, axis, demand, counts)
             if settings[axis, _OUTPUT_DELAY] > 0.0:
@@ -192,7 +203,7 @@ def latch(plant_state: Float, settings: Float, memory: Float, clock: Int, axis: 
     elif offset_s > SERVO_PERIOD_S:
         offset_s = SERVO_PERIOD_S
     angle = plant_state[axis] + offset_s * (plant_state[axis + 2] + 0.5 * offset_s * plant_state[axis + 4])
-    return floor(angle * settings[axis, _COUNTS_PER_RAD] + memory[axis, _NOISE] + 0.5)
+    return _resolver(settings, memory, axis, angle)
 
 
 @kernel
@@ -466,6 +477,8 @@ def _axis_settings(axis: MachineAxis, torque_limits_Nm: tuple[float, float]) -> 
         float(axis.output_delay_periods),
         axis.rated_torque_Nm,
         axis.torque_per_volt,
+        axis.resolver_eccentricity_counts,
+        axis.resolver_eccentricity_rad,
     ]
 
 

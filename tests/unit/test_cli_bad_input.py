@@ -70,7 +70,7 @@ def config(tmp_path):
         ("role: slave", "role: master", "there must be one axis with role master and one with role slave"),
         ("name: paper", "name: paper\nname: twice", "line 5: key 'name' is given twice"),
         ("name: paper", "name: [", "not valid YAML"),
-        ("K_P: 8000", "K_P: many", "axes.cv.emulation.gains.K_P: 'many' should be a valid integer"),
+        ("K_P: 6800", "K_P: many", "axes.cv.emulation.gains.K_P: 'many' should be a valid integer"),
     ],
 )
 def test_configuration(run, config, old, new, sentence):

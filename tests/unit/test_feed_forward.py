@@ -86,9 +86,9 @@ def test_where_the_linkage_does_not_close_no_torque_is_asked_for():
 
 
 def test_the_torque_leads_by_what_the_drive_needs_less_half_a_cycle():
-    # Half a servo period and 1 ms of amplifier: 1.488 ms; a torque held from one cycle before its target on: -0.5 ms.
-    assert torque_delay_s(PAPER) == pytest.approx(0.5 / 1024 + 0.001)
-    assert torque_lead_s(PAPER.cycle_s, torque_delay_s(PAPER)) == pytest.approx(0.000988, abs=1e-6)
+    # 1.5 servo periods and 1 ms of amplifier: 2.465 ms; a torque held from one cycle before its target on: -0.5 ms.
+    assert torque_delay_s(PAPER) == pytest.approx(1.5 / 1024 + 0.001)
+    assert torque_lead_s(PAPER.cycle_s, torque_delay_s(PAPER)) == pytest.approx(0.001965, abs=1e-6)
     assert torque_delay_s(with_feed_forward("{torque_delay_us: 700}")) == pytest.approx(0.0007)
 
 

@@ -99,14 +99,11 @@ def test_the_delay_margin_is_where_stability_ends(model):
 
 
 def test_an_output_delay_is_a_delay(model):
-    text = "torque_per_volt_Nm: 0.45"
     cam = compile_config(PAPER)
-    late = changed((text, f"{text}\n      output_delay_periods: 1"))
-    late_model = loop_model(late, cam.profile, cam.closure, positions=36, frequencies=300)
-    already = PAPER.ordered_axes[0].emulation.output_delay_periods
-    assert spectral_radius(late_model, GAINS, 0.0) == pytest.approx(
-        spectral_radius(model, GAINS, (1 - already) / 1024), rel=1e-9
-    )
+    prompt = changed(("output_delay_periods: 1", "output_delay_periods: 0"))
+    prompt_model = loop_model(prompt, cam.profile, cam.closure, positions=36, frequencies=300)
+    assert spectral_radius(model, GAINS) == pytest.approx(spectral_radius(prompt_model, GAINS, 1 / 1024), rel=1e-9)
+    assert delay_margin_s(model, GAINS) == pytest.approx(delay_margin_s(prompt_model, GAINS) - 1 / 1024, abs=1e-6)
 
 
 def test_problems_are_told_each_in_a_sentence(model):

@@ -104,10 +104,14 @@ def set_points(pending, frames):
     ("replacements", "from_s", "until_s"),
     [
         ((), 0.45, 2.2),
-        ((("torque_per_volt_Nm: 0.45", "torque_per_volt_Nm: 0.45\n      output_delay_periods: 1"),), 1.7, 2.4),
-        ((("K_P: 4000, K_I: 0, K_D: 0,", "K_P: 3000, K_I: 7, K_D: 9000,"), ("cycle_us: 1000", "cycle_us: 2000")), 1, 2),
+        ((("output_delay_periods: 1", "output_delay_periods: 0\n      resolver_eccentricity_counts: 7.5"),), 1.7, 2.4),
+        (
+            (("K_P: 5000, K_I: 200, K_D: 0,", "K_P: 3000, K_I: 7, K_D: 9000,"), ("cycle_us: 1000", "cycle_us: 2000")),
+            1,
+            2,
+        ),
     ],
-    ids=["from standstill", "with an output delay", "all gains, another cycle"],
+    ids=["from standstill", "without output delay, eccentric resolvers", "all gains, another cycle"],
 )
 def test_the_fast_loop_gives_the_emulator_s_counts(replacements, from_s, until_s):
     config = changed(*replacements)

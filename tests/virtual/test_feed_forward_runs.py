@@ -74,7 +74,7 @@ def test_with_the_exact_model_a_count_is_left_on_the_cam_and_on_the_way_down(exa
 
 def test_no_other_instant_of_the_torque_is_better(exact):
     best = exact.errors(Phase.CAM).rms[1]
-    for delay_us in (500, 2500):
+    for delay_us in (500, 4500):
         other = run(f"{{enabled: true, torque_delay_us: {delay_us}}}").errors(Phase.CAM).rms[1]
         assert other > best + 0.05
 
