@@ -312,7 +312,7 @@ def test_a_lost_heartbeat_makes_a_quick_stop():
 
 
 def test_a_following_error_beyond_its_limit_makes_a_quick_stop():
-    tight = changed(("following_error_counts: 300", "following_error_counts: 8"))
+    tight = changed(("following_error_counts: 300", "following_error_counts: 12"))
     session = Session(tight, PAPER, cycles=5).to_end()
     assert session.core.stopped_by in {StopReason.FOLLOWING_ERROR, StopReason.EMERGENCY}
     session.assert_safe()
@@ -320,7 +320,7 @@ def test_a_following_error_beyond_its_limit_makes_a_quick_stop():
 
 def test_a_warning_only_warns():
     lenient = changed(
-        ("following_error_counts: 300", "following_error_counts: 8"),
+        ("following_error_counts: 300", "following_error_counts: 12"),
         ("persistence_cycles: 1, reaction: quick_stop", "persistence_cycles: 1, reaction: warn"),
         ("emergency: {reaction: quick_stop}", "emergency: {reaction: warn}"),
         ("drive_fault: {reaction: quick_stop}", "drive_fault: {reaction: warn}"),
