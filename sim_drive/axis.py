@@ -5,7 +5,6 @@ mode of operation does with set-points is in `sim_drive.modes`, and what the two
 """
 
 from collections.abc import Callable
-from math import floor
 from typing import Final
 
 from config.quirks import Quirk
@@ -31,6 +30,7 @@ from sim_drive.cia402 import (
 )
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.emcy import AxisErrors, EmergencyCode, ErrorRegister
+from sim_drive.measured import MeasuredMotion
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.camming import Camming
 from sim_drive.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
@@ -39,9 +39,10 @@ from sim_drive.modes.interpolated import InterpolatedPosition
 from sim_drive.modes.profile_position import ProfilePosition
 from sim_drive.modes.profile_torque import ProfileTorque
 from sim_drive.modes.profile_velocity import ProfileVelocity
-from sim_drive.motion import Latch, Motion, SetPointSource, wrap_int32
+from sim_drive.motion import Latch, SetPointSource, wrap_int32
 from sim_drive.quirks import MODE_SWITCH_NS
 from sim_drive.settings import DriveSettings
+from sim_drive.switches import DigitalInput
 from sim_drive.touch_probe import TouchProbe
 
 __all__ = ["CONTROLLER_GAIN_COUNT", "FOLLOWING_ERROR_WINDOW_OFF", "Axis", "Latch", "SetPointSource", "wrap_int32"]
@@ -50,7 +51,6 @@ FOLLOWING_ERROR_WINDOW_OFF: Final = 0xFFFFFFFF
 CONTROLLER_GAIN_COUNT: Final = 5
 
 _HALF: Final = 1 << 31
-_INT16_MAX: Final = 32767
 _NS_PER_MS: Final = 1_000_000
 
 _BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
@@ -79,7 +79,7 @@ _TIMED_MODES: Final = frozenset(
 """Modes in which the interpolation time must not change."""
 
 
-class Axis(Motion):
+class Axis(MeasuredMotion):
     """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it.
 
     A ramp before a state is left (605Bh, 605Ch) is run in the state; enabling the operation again calls it off.
@@ -89,16 +89,14 @@ class Axis(Motion):
         "_active",
         "_after_ramp",
         "_coming_mode",
-        "_digital_inputs",
         "_enabled_bits",
         "_errors",
         "_events",
-        "_following_error",
         "_following_error_since_ns",
         "_following_error_timeout",
         "_following_error_window",
         "_gain_entries",
-        "_has_switches",
+        "_has_limit_switches",
         "_homing",
         "_idle_controlword",
         "_interpolation_exponent",
@@ -107,20 +105,14 @@ class Axis(Motion):
         "_mode_display",
         "_mode_entry",
         "_modes",
-        "_position_actual",
-        "_position_demand",
         "_rated_torque_Nm",
-        "_sampled_at_ns",
         "_state",
         "_statusword",
         "_ticking",
-        "_torque_actual",
         "_torque_limits",
         "_torque_offset",
         "_touch_probe",
-        "_velocity_actual",
         "gains",
-        "is_powered",
         "is_switched_off",
         "negative_torque_limit_Nm",
         "node_id",
@@ -150,15 +142,6 @@ class Axis(Motion):
         self._mode_entry = entry(objects.MODES_OF_OPERATION)
         self._mode_display = entry(objects.MODES_OF_OPERATION_DISPLAY)
         self._torque_offset = entry(objects.TORQUE_OFFSET)
-        self._position_demand = entry(objects.POSITION_DEMAND_VALUE)
-        self._position_actual = entry(objects.POSITION_ACTUAL_VALUE)
-        self._velocity_actual = entry(objects.VELOCITY_ACTUAL_VALUE)
-        self._torque_actual = entry(objects.TORQUE_ACTUAL_VALUE)
-        self._following_error = entry(objects.FOLLOWING_ERROR_ACTUAL_VALUE)
-        self._digital_inputs = entry(objects.DIGITAL_INPUTS)
-        self._digital_inputs.on_read = self._read_inputs
-        entry(objects.VELOCITY_DEMAND_VALUE).on_read = self._read_velocity_demand
-        entry(objects.TORQUE_DEMAND).on_read = self._read_torque_demand
         self._following_error_window = entry(objects.FOLLOWING_ERROR_WINDOW)
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
@@ -175,7 +158,7 @@ class Axis(Motion):
         self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
         self._rated_torque_Nm = settings.rated_torque_Nm
         self._touch_probe = TouchProbe(self)
-        self._has_switches = bool(settings.switches.fitted)
+        self._has_limit_switches = bool(settings.switches.fitted & ~DigitalInput.HOME)
         self._set_defaults()
         self._set_hooks()
 
@@ -204,14 +187,11 @@ class Axis(Motion):
         """Demand at the last servo tick, shaft frame."""
         self._state = PowerState.NOT_READY_TO_SWITCH_ON
         self._mode = Mode.NONE
-        self.is_powered = False
-        """Whether the amplifier may put torque on the motor."""
         self.is_switched_off = False
         """Without supply, as the drive has it."""
         self._after_ramp: PowerState | None = None
         """The state that is next when the axis has come to rest."""
         self._following_error_since_ns: int | None = None
-        self._sampled_at_ns = -1
         self._coming_mode: tuple[int, int] | None = None
         """With a slow mode switch: the mode, and when it is entered."""
         is_odd = Quirk.SET_POINT_ACKNOWLEDGE_STAYS in settings.quirks
@@ -226,6 +206,8 @@ class Axis(Motion):
         settings = self.settings
         defaults = {
             (objects.POSITION_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
+            (objects.VELOCITY_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
+            (objects.FEED_CONSTANT, 1): settings.counts_per_revolution,
             (objects.MOTOR_RATED_TORQUE, 0): round(settings.rated_torque_Nm * 1000.0),
         }
         if settings.gains is not None:
@@ -242,25 +224,21 @@ class Axis(Motion):
         self._mode_entry.on_write = self._on_mode
         self._interpolation_value.on_write = self._on_interpolation_value
         self._interpolation_exponent.on_write = self._on_interpolation_exponent
+        for entry in (*self._scale_entries, self.entry(objects.POLARITY)):
+            entry.on_write = self._scaling_writer(entry)
         for place, entry in enumerate(self._torque_limits):
             entry.on_write = self._torque_limit_writer(place)
         for place, entry in enumerate(self._gain_entries):
             entry.on_write = self._gain_writer(place)
-        for entry in (
-            self._position_demand,
-            self._position_actual,
-            self._velocity_actual,
-            self._torque_actual,
-            self._following_error,
-        ):
-            entry.on_read = self._live_reader(entry)
 
-    def _live_reader(self, entry: Entry) -> Callable[[int], int]:
-        def read(now_ns: int) -> int:
-            self.sample(now_ns)
-            return entry.value
+    def _scaling_writer(self, entry: Entry) -> Callable[[int, int], AbortCode | None]:
+        def write(value: int, now_ns: int) -> AbortCode | None:
+            if self.is_powered:
+                return AbortCode.CANNOT_STORE_DEVICE_STATE
+            self.set_scaling(entry, value)
+            return None
 
-        return read
+        return write
 
     def _gain_writer(self, place: int) -> Callable[[int, int], AbortCode | None]:
         def write(value: int, now_ns: int) -> AbortCode | None:
@@ -280,6 +258,7 @@ class Axis(Motion):
             mode.reset()
         self._touch_probe.restore()
         self._idle_controlword = _NO_CONTROLWORD
+        self.set_scaling()
         self.offset = self.settings.initial_offset_counts
         self.is_powered = False
         self.internal_bits = 0
@@ -314,11 +293,6 @@ class Axis(Motion):
         return self.offset
 
     @property
-    def is_brake_released(self) -> bool:
-        """Whether the holding brake is open: exactly while there is torque to hold the axis."""
-        return self.is_powered
-
-    @property
     def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
         """Torque offset 60B2h, to be added to the controller's torque; 0 unless operation is enabled."""
         if self._state is not _OPERATION_ENABLED:
@@ -327,11 +301,16 @@ class Axis(Motion):
 
     @property
     def torque_demand_Nm(self) -> float | None:  # noqa: N802 - the unit is part of the name
-        """Torque that a torque mode asks for, within its limits; None where the position controller decides."""
+        """Torque that a torque mode asks for, within its limits; None where the position controller decides.
+
+        A limit switch lets no torque pass that would drive the axis further on.
+        """
         demand = self.torque_demand
         if demand is None or not self.is_powered:
             return None
         torque = demand * 0.001 * self._rated_torque_Nm
+        if self.barred and self.is_barred(torque):
+            return 0.0
         return max(-self.negative_torque_limit_Nm, min(self.torque_limit_Nm, torque))
 
     def _limit_torque(self, maximum: int, positive: int, negative: int) -> None:
@@ -364,6 +343,8 @@ class Axis(Motion):
         demand = self.demand.at(now_ns)
         self.position_demand_counts = demand
         if self._active is not None:
+            if self._has_limit_switches:
+                self.look_at_switches(now_ns, self._mode is Mode.HOMING)
             if self.is_guarded and now_ns - self.set_point_at_ns > self.set_point_timeout_ns:
                 self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
                 return
@@ -378,8 +359,9 @@ class Axis(Motion):
                 self._go_to_state(self._after_ramp, now_ns)
                 return
         window = self._following_error_window.value
-        if self._following_error_since_ns is not None or not -window <= demand - shaft_counts <= window:
-            self._guard_following_error(demand - shaft_counts, now_ns)
+        error = (demand - shaft_counts) * self.unit
+        if self._following_error_since_ns is not None or not -window <= error <= window:
+            self._guard_following_error(error, now_ns)
 
     def _tick_without_power(self, now_ns: int) -> None:
         if self.is_switched_off:
@@ -410,58 +392,6 @@ class Axis(Motion):
             return
         self.set_internal_bit(_FOLLOWING_ERROR, True)
         self.trip(EmergencyCode.FOLLOWING_ERROR, _DRIVE_ERROR, now_ns)
-
-    # -- SYNC ----------------------------------------------------------------------------------------------------
-
-    def sample(self, now_ns: int) -> None:
-        """Bring the actual and demand values in the dictionary up to ``now_ns``."""
-        if now_ns == self._sampled_at_ns:
-            return
-        self._sampled_at_ns = now_ns
-        position, velocity, torque = self.latch(now_ns)
-        demand = floor(self.demand.at(now_ns) + 0.5) if self.is_powered else position
-        # What is within its type, as it nearly always is, is put there without a call.
-        shown = position + self.offset
-        self._position_actual.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
-        shown = demand + self.offset
-        self._position_demand.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
-        error = demand - position
-        self._following_error.value = error if -_HALF < error < _HALF else _clamp(error, _HALF - 1)
-        rate = floor(velocity + 0.5)
-        self._velocity_actual.value = rate if -_HALF < rate < _HALF else _clamp(rate, _HALF - 1)
-        if self._has_switches:
-            self._digital_inputs.value = self.settings.switches.inputs(position)
-        self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
-
-    def sample_actual_position(self, now_ns: int) -> None:
-        """``sample`` for a SYNC whose TPDOs carry no measured value but actual position and torque.
-
-        The other values are brought up to date when they are asked for.
-        """
-        if now_ns == self._sampled_at_ns:
-            return
-        position, _, torque = self.latch(now_ns)
-        shown = position + self.offset
-        self._position_actual.value = shown if -_HALF <= shown < _HALF else wrap_int32(shown)
-        self._torque_actual.value = torque if -_INT16_MAX <= torque <= _INT16_MAX else _clamp(torque, _INT16_MAX)
-
-    def _read_velocity_demand(self, now_ns: int) -> int:
-        if not self.is_powered:
-            return 0
-        return _clamp(floor(self.demand.velocity_at(now_ns) + 0.5), _HALF - 1)
-
-    def _read_torque_demand(self, now_ns: int) -> int:
-        """What a torque mode asks for; under the position controller, what the amplifier gives."""
-        if self.torque_demand is None:
-            return _clamp(self.latch(now_ns)[2], _INT16_MAX)
-        return _clamp(floor(self.torque_demand + 0.5), _INT16_MAX)
-
-    def _read_inputs(self, now_ns: int) -> int:
-        return self.settings.switches.inputs(self.latch(now_ns)[0])
-
-    def forget_sample(self) -> None:
-        """The frames of counts have moved: what has been sampled for this instant no longer holds."""
-        self._sampled_at_ns = -1
 
     # -- controlword and state -----------------------------------------------------------------------------------
 
@@ -636,6 +566,8 @@ class Axis(Motion):
         self.on_sync = _nothing
         self.is_guarded = False
         self.is_halted = False
+        self.barred = 0
+        self.is_at_switch = False
         if active is not None:
             active.leave(now_ns)
 
@@ -676,13 +608,11 @@ class Axis(Motion):
         word = STATE_BITS[self._state] | _BASE_BITS | internal | mode.status_bits
         if self._state is _OPERATION_ENABLED:
             word |= self._enabled_bits
+        if self.is_at_switch:
+            word |= _LIMITED
         self._statusword.value = word
         self._mode_display.value = int(self._mode)
 
 
 def _nothing(now_ns: int) -> None:
     pass
-
-
-def _clamp(value: int, bound: int) -> int:
-    return max(-bound, min(bound, value))

@@ -1,4 +1,7 @@
-"""The position demand between set-points: hold, line, braking ramp, or a planned sequence, as a function of time."""
+"""The position demand between set-points: hold, line, braking ramp, or a planned sequence, as a function of time.
+
+All in counts of the shaft and their derivatives.
+"""
 
 from collections.abc import Sequence
 from math import inf
@@ -8,10 +11,14 @@ _S_PER_NS: Final = 1e-9
 
 
 class Piece(NamedTuple):
-    """A span of constant acceleration (counts/s^2); an infinite one never ends."""
+    """A span of constant acceleration (counts/s^2), or, with a jerk (counts/s^3), of one that changes evenly.
+
+    An infinite one, which has no jerk, never ends.
+    """
 
     acceleration: float
     duration_s: float
+    jerk: float = 0.0
 
 
 class _Planned(NamedTuple):
@@ -19,6 +26,7 @@ class _Planned(NamedTuple):
     position: float
     velocity: float
     acceleration: float
+    jerk: float
 
 
 class Demand:
@@ -67,14 +75,30 @@ class Demand:
         return bool(self._planned)
 
     def _beyond(self, t: float) -> tuple[float, float]:
-        """Position and velocity of a plan after its first piece."""
+        """Position and velocity of a plan after its first piece, or in that if it has a jerk."""
         if t >= self._end_s:
             return self._end, 0.0
-        for start_s, position, velocity, acceleration in reversed(self._planned):
+        for start_s, position, velocity, acceleration, jerk in reversed(self._planned):
             if t >= start_s:
                 t -= start_s
-                return position + (velocity + 0.5 * acceleration * t) * t, velocity + acceleration * t
+                if jerk == 0.0:
+                    return position + (velocity + 0.5 * acceleration * t) * t, velocity + acceleration * t
+                return (
+                    position + (velocity + (0.5 * acceleration + jerk * t / 6.0) * t) * t,
+                    velocity + (acceleration + 0.5 * jerk * t) * t,
+                )
         return self.position, self.velocity
+
+    def acceleration_at(self, now_ns: int) -> float:
+        """Demand acceleration in counts/s^2 at ``now_ns``."""
+        t = (now_ns - self.start_ns) * _S_PER_NS
+        if not self._planned:
+            return self.acceleration if 0.0 <= t < self.duration_s else 0.0
+        if t < self._end_s:
+            for piece in reversed(self._planned):
+                if t >= piece.start_s:
+                    return piece.acceleration + piece.jerk * (t - piece.start_s)
+        return 0.0
 
     def span_ahead(self, now_ns: int) -> tuple[float, float]:
         """Least and greatest position from ``now_ns`` on, in counts; infinite if it never comes to rest."""
@@ -136,7 +160,7 @@ class Demand:
         self.plan([Piece(0.0, inf)], now_ns)
 
     def plan(self, pieces: Sequence[Piece], now_ns: int, end: float | None = None) -> None:
-        """Go on from where the demand is now, with the velocity it has, in ``pieces`` of constant acceleration.
+        """Go on from where the demand is now, with the velocity it has, in ``pieces``.
 
         After the last one, unless that is infinite, it rests: at ``end`` if given, which is then where the pieces lead.
         """
@@ -144,18 +168,22 @@ class Demand:
         velocity = self.velocity_at(now_ns)
         planned: list[_Planned] = []
         start_s = 0.0
-        for acceleration, duration_s in pieces:
-            planned.append(_Planned(start_s, position, velocity, acceleration))
+        for acceleration, duration_s, jerk in pieces:
+            planned.append(_Planned(start_s, position, velocity, acceleration, jerk))
             start_s += duration_s
-            if duration_s < inf:
+            if jerk != 0.0:
+                position += (velocity + (0.5 * acceleration + jerk * duration_s / 6.0) * duration_s) * duration_s
+                velocity += (acceleration + 0.5 * jerk * duration_s) * duration_s
+            elif duration_s < inf:
                 position += (velocity + 0.5 * acceleration * duration_s) * duration_s
                 velocity += acceleration * duration_s
         if not planned:
             self.hold(position if end is None else end)
             return
         self.start_ns = now_ns
-        _, self.position, self.velocity, self.acceleration = planned[0]
-        self.duration_s = pieces[0].duration_s
+        _, self.position, self.velocity, self.acceleration, jerk = planned[0]
+        # The parabola that is looked at first has no jerk: a piece that has one is looked up like the later ones.
+        self.duration_s = pieces[0].duration_s if jerk == 0.0 else 0.0
         self._planned = tuple(planned)
         self._end = position if end is None else end
         self._end_s = start_s

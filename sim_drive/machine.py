@@ -46,6 +46,11 @@ class DriveAxis(Protocol):
     @property
     def torque_offset_Nm(self) -> float: ...  # noqa: N802
     @property
+    def velocity_offset(self) -> float:
+        """Counts/s that the controller's velocity feed-forward is to have beside the demand's own."""
+        ...
+
+    @property
     def torque_demand_Nm(self) -> float | None: ...  # noqa: N802
     @property
     def torque_limit_Nm(self) -> float: ...  # noqa: N802
@@ -508,6 +513,7 @@ class EmulatedMachine:
                 axis.torque_per_volt,
                 drive_axis.torque_limit_Nm,
                 drive_axis.negative_torque_limit_Nm,
+                drive_axis.velocity_offset,
             )
         else:
             # The controller is to start without a bump when it gets the axis back.

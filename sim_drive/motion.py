@@ -1,8 +1,8 @@
 """What an axis and its modes share: the position demand, the two frames of counts, set-points in time, and limits.
 
-Two frames of counts meet here. The *shaft* frame is what the resolver counts since power-on; the *user* frame is that
-of the 60xxh objects: user = shaft + offset, as INTEGER32 with wrap. Homing moves the offset, never the demand in shaft
-counts.
+Two frames meet here. The *shaft* frame is what the resolver counts since power-on; the *user* frame is that of the
+60xxh objects: user = shaft + offset, as INTEGER32 with wrap, the shaft's counts being brought to user units first
+(`sim_drive.scaling`; by default they are the same). Homing moves the offset, never the demand in shaft counts.
 """
 
 from abc import ABC, abstractmethod
@@ -16,7 +16,9 @@ from sim_drive.cia402 import STOP_RAMPS, Statusword, StopRamp
 from sim_drive.demand import Demand
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.logical_axes import of_axis
+from sim_drive.scaling import IDENTITY, make_scaling
 from sim_drive.settings import DriveSettings
+from sim_drive.switches import DigitalInput
 
 Latch = Callable[[int], tuple[int, float, int]]
 """Gives shaft position (counts), velocity (counts/s) and torque (per mille of rated torque) as of an instant in ns."""
@@ -26,6 +28,7 @@ _HALF: Final = 1 << 31
 _S_PER_NS: Final = 1e-9
 _TWO_TICKS_S: Final = 0.002
 """Room for the servo tick at which braking is found to be due, and the one before it."""
+_LIMIT_SWITCHES: Final = int(DigitalInput.NEGATIVE_LIMIT | DigitalInput.POSITIVE_LIMIT)
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
 
 
@@ -57,11 +60,14 @@ class Motion(ABC):
         "_max_profile_velocity",
         "_max_speed",
         "_quick_stop_deceleration",
+        "_scale_entries",
         "_set_point_limit",
+        "barred",
         "controlword",
         "demand",
         "dictionary",
         "internal_bits",
+        "is_at_switch",
         "is_guarded",
         "is_halted",
         "latch",
@@ -71,12 +77,16 @@ class Motion(ABC):
         "offset",
         "period_ns",
         "period_s",
+        "scaling",
         "set_point_at_ns",
         "set_point_timeout_ns",
         "settings",
         "shaft_counts",
         "source",
         "torque_demand",
+        "unit",
+        "velocity_offset",
+        "velocity_unit",
     )
 
     def __init__(self, dictionary: LiveDictionary, settings: DriveSettings, number: int = 1) -> None:
@@ -91,9 +101,15 @@ class Motion(ABC):
         self.shaft_counts = 0
         """Resolver counts at the last servo tick."""
         self.offset = settings.initial_offset_counts
-        """Position actual value minus shaft counts, before the wrap to INTEGER32."""
+        """Position actual value minus that of shaft count 0, in user units, before the wrap to INTEGER32."""
         self.internal_bits = 0
         """Statusword bits 11 and 13, as far as they are the axis' and not a mode's."""
+        self.barred = 0
+        """Direction of the shaft (1 or -1) in which a limit switch stands; 0: none does, or it does not matter."""
+        self.is_at_switch = False
+        """Whether a limit switch has stopped the axis, or keeps it from going on."""
+        self.velocity_offset = 0.0
+        """Velocity offset 60B1h as far as it is to be fed forward, in counts/s."""
         self.is_guarded = False
         """Whether a set-point is expected within the time-out."""
         self.set_point_at_ns = 0
@@ -115,6 +131,20 @@ class Motion(ABC):
         self._max_profile_velocity = self.entry(objects.MAX_PROFILE_VELOCITY)
         self._max_speed = self.entry(objects.MAX_MOTOR_SPEED)
         self._halt_option = self.entry(objects.HALT_OPTION_CODE)
+        self._scale_entries = tuple(
+            self.entry(index, subindex)
+            for index in (
+                objects.POSITION_ENCODER_RESOLUTION,
+                objects.VELOCITY_ENCODER_RESOLUTION,
+                objects.GEAR_RATIO,
+                objects.FEED_CONSTANT,
+            )
+            for subindex in (1, 2)
+        )
+        self.scaling = IDENTITY
+        """From counts to user units; the next two are parts of it."""
+        self.unit = 1.0
+        self.velocity_unit = 1.0
         self.limit_low = self.entry(objects.SOFTWARE_POSITION_LIMIT, 1)
         self.limit_high = self.entry(objects.SOFTWARE_POSITION_LIMIT, 2)
 
@@ -149,6 +179,31 @@ class Motion(ABC):
     def forget_sample(self) -> None:
         """The frames of counts have moved: what has been sampled for this instant no longer holds."""
 
+    def set_scaling(self, changed: Entry | None = None, value: int = 0) -> None:
+        """Take the factor group as the dictionary has it, but for ``changed``, which is about to become ``value``."""
+        polarity = self.entry(objects.POLARITY)
+        sizes: list[int] = [value if entry is changed else entry.value for entry in self._scale_entries]
+        self.scaling = make_scaling(
+            value if changed is polarity else polarity.value,
+            (sizes[0], sizes[1]),
+            (sizes[2], sizes[3]),
+            (sizes[4], sizes[5]),
+            (sizes[6], sizes[7]),
+        )
+        self.unit = self.scaling.position_unit
+        self.velocity_unit = self.scaling.velocity_unit
+        self.forget_sample()
+
+    def user_position(self, shaft_counts: int) -> int:
+        """A position of the shaft in the user frame, before the wrap to INTEGER32."""
+        if self.unit == 1.0:
+            return shaft_counts + self.offset
+        return self.scaling.position(shaft_counts) + self.offset
+
+    def rate_of(self, value: float) -> float:
+        """An amount of velocity, acceleration or jerk in user units, in counts and seconds; its sign stays."""
+        return value / abs(self.velocity_unit)
+
     def set_period(self, value: int, exponent: int) -> None:
         """Take the interpolation time 60C2h, ``value`` times ten to the ``exponent`` seconds."""
         self.period_ns = value * 10 ** (9 + exponent)
@@ -166,6 +221,29 @@ class Motion(ABC):
         self.internal_bits = self.internal_bits | bit if is_set else self.internal_bits & ~bit
         self.show_status()
 
+    def is_barred(self, direction: float) -> bool:
+        """Whether a limit switch keeps the shaft from moving in ``direction`` (by its sign); bit 11 shows it."""
+        if direction * self.barred <= 0.0:
+            return False
+        if not self.is_at_switch:
+            self.is_at_switch = True
+            self.show_status()
+        return True
+
+    def look_at_switches(self, now_ns: int, is_homing: bool) -> None:
+        """Stop at a limit switch that is on, unless the axis is homing and so looks for it itself."""
+        inputs = self.settings.switches.inputs(self.shaft_counts)
+        if is_homing or not inputs & _LIMIT_SWITCHES:
+            self.barred = 0
+            if self.is_at_switch:
+                self.is_at_switch = False
+                self.show_status()
+            return
+        self.barred = 1 if inputs & DigitalInput.POSITIVE_LIMIT else -1
+        demand = self.demand
+        if not demand.is_over(now_ns) and self.is_barred(demand.velocity_at(now_ns)):
+            demand.brake(now_ns, self.quick_stop_deceleration)
+
     def within_limits(self, target: int) -> int:
         """``target`` (user frame), or the software position limit 607Dh that it is beyond; bit 11 shows which."""
         low = self.limit_low.value
@@ -180,28 +258,29 @@ class Motion(ABC):
     @property
     def acceleration(self) -> float:
         """Profile acceleration 6083h within 60C5h, in counts/s^2."""
-        return float(min(self._acceleration.value, self._max_acceleration.value))
+        return self.rate_of(min(self._acceleration.value, self._max_acceleration.value))
 
     @property
     def deceleration(self) -> float:
         """Profile deceleration 6084h within 60C6h, in counts/s^2."""
-        return float(min(self._deceleration.value, self._max_deceleration.value))
+        return self.rate_of(min(self._deceleration.value, self._max_deceleration.value))
 
     @property
     def max_acceleration(self) -> float:
         """Max acceleration 60C5h in counts/s^2."""
-        return float(self._max_acceleration.value)
+        return self.rate_of(self._max_acceleration.value)
 
     @property
     def max_deceleration(self) -> float:
         """Max deceleration 60C6h in counts/s^2."""
-        return float(self._max_deceleration.value)
+        return self.rate_of(self._max_deceleration.value)
 
     @property
     def max_velocity(self) -> float:
-        """What 607Fh (counts/s) and 6080h (revolutions a minute) both allow, in counts/s."""
+        """What 607Fh (user units) and 6080h (revolutions of the motor a minute) both allow, in counts/s."""
         return min(
-            float(self._max_profile_velocity.value), self._max_speed.value * self.settings.counts_per_revolution / 60.0
+            self.rate_of(self._max_profile_velocity.value),
+            self._max_speed.value * self.settings.counts_per_revolution / 60.0,
         )
 
     def deceleration_of(self, ramp: StopRamp) -> float:
@@ -209,8 +288,13 @@ class Motion(ABC):
         if ramp is StopRamp.SLOW_DOWN:
             return self.deceleration
         if ramp is StopRamp.QUICK_STOP:
-            return float(self._quick_stop_deceleration.value)
-        return float(self._max_deceleration.value)
+            return self.quick_stop_deceleration
+        return self.max_deceleration
+
+    @property
+    def quick_stop_deceleration(self) -> float:
+        """Quick stop deceleration 6085h in counts/s^2."""
+        return self.rate_of(self._quick_stop_deceleration.value)
 
     def slow_down(self, now_ns: int) -> None:
         """Bring the demand to rest with the profile deceleration, if it moves."""
@@ -232,7 +316,9 @@ class Motion(ABC):
         """The demand in the user frame."""
         here = self.demand.at(now_ns)
         whole = floor(here)
-        return wrap_int32(whole + self.offset) + here - whole
+        if self.unit == 1.0:
+            return wrap_int32(whole + self.offset) + here - whole
+        return wrap_int32(self.user_position(whole)) + (here - whole) * self.unit
 
     def brake(self, deceleration: float, now_ns: int) -> None:
         """Ramp the demand down to rest; more steeply, if it would else come to rest beyond a software limit 607Dh."""
@@ -241,10 +327,15 @@ class Motion(ABC):
         if low < high and not (low == -_HALF and high == _HALF - 1):
             velocity = self.demand.velocity_at(now_ns)
             place = self._place(now_ns)
-            room = high - place if velocity > 0.0 else place - low
+            room = self._room(place, velocity)
             if room > 0.0:
                 deceleration = max(deceleration, velocity * velocity / (2.0 * room))
         self.demand.brake(now_ns, deceleration)
+
+    def _room(self, place: float, velocity: float) -> float:
+        """Counts from ``place`` (user frame) to the software limit that ``velocity`` of the shaft leads to."""
+        is_up = velocity * self.unit > 0.0
+        return (self.limit_high.value - place if is_up else place - self.limit_low.value) / abs(self.unit)
 
     def stop_at_limits(self, now_ns: int) -> bool:
         """Brake where the demand would else leave the software position limits 607Dh; whether it had to.
@@ -260,12 +351,13 @@ class Motion(ABC):
         least, greatest = demand.span_ahead(now_ns)
         here = demand.at(now_ns)
         place = self._place(now_ns)
-        if place + greatest - here <= high and place + least - here >= low:
+        ahead = ((least - here) * self.unit, (greatest - here) * self.unit)
+        if place + max(ahead) <= high and place + min(ahead) >= low:
             return False
         velocity = demand.velocity_at(now_ns)
         speed = abs(velocity)
-        room = high - place if velocity > 0.0 else place - low
-        stopping = speed * speed / (2.0 * self._quick_stop_deceleration.value)
+        room = self._room(place, velocity)
+        stopping = speed * speed / (2.0 * self.quick_stop_deceleration)
         if speed == 0.0 or room > stopping + speed * _TWO_TICKS_S:
             return False
         if room <= 0.0:
@@ -277,7 +369,7 @@ class Motion(ABC):
         return True
 
     def overrun_s(self, target: float, distance: float) -> float:
-        """For how long a line over ``distance`` to ``target`` (user frame) may go on without leaving the limits."""
+        """For how long a line over ``distance`` to ``target`` (user units) may go on without leaving the limits."""
         if distance == 0.0:
             return self.period_s
         low = self.limit_low.value
@@ -290,5 +382,8 @@ class Motion(ABC):
     def to_shaft(self, position: float, demand: float) -> float:
         """The shaft position that shows as ``position`` in the user frame and is nearest to ``demand``."""
         reference = floor(demand)
-        distance = position - self.offset - reference
-        return reference + ((distance + _HALF) % _WRAP) - _HALF
+        if self.unit == 1.0:
+            distance = position - self.offset - reference
+            return reference + ((distance + _HALF) % _WRAP) - _HALF
+        distance = position - self.user_position(reference)
+        return reference + (((distance + _HALF) % _WRAP) - _HALF) / self.unit

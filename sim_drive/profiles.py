@@ -56,3 +56,44 @@ def to_position(
     if peak > 0.0:
         pieces.append(Piece(-direction * deceleration, peak / deceleration))
     return pieces
+
+
+def through_position(
+    distance: float, velocity: float, cruise: float, acceleration: float, deceleration: float, end: float
+) -> list[Piece]:
+    """From ``velocity`` through ``distance`` (counts) with the speed ``end``, or what is nearest to it, and on with it.
+
+    ``cruise`` and ``end`` are positive, in counts/s. Where the velocity leads away, it brakes to rest first.
+    """
+    pieces: list[Piece] = []
+    direction = copysign(1.0, distance)
+    if velocity * direction < 0.0:
+        pieces.append(Piece(direction * deceleration, abs(velocity) / deceleration))
+        distance -= velocity * abs(velocity) / (2.0 * deceleration)
+        velocity = 0.0
+    distance = abs(distance)
+    speed = abs(velocity)
+    squares = 2.0 * distance * acceleration * deceleration
+    peak = sqrt((squares + speed * speed * deceleration + end * end * acceleration) / (acceleration + deceleration))
+    if peak < end:
+        # Too short to become as fast as that.
+        peak = sqrt(speed * speed + 2.0 * acceleration * distance)
+        end_there = peak
+    elif peak < speed:
+        # Too short to become as slow as that.
+        peak = speed
+        end_there = sqrt(max(speed * speed - 2.0 * deceleration * distance, 0.0))
+    else:
+        peak = max(min(peak, cruise), end)
+        end_there = end
+    if speed != peak:
+        rate = acceleration if peak > speed else -deceleration
+        pieces.append(Piece(direction * rate, (peak - speed) / rate))
+        distance -= (peak * peak - speed * speed) / (2.0 * rate)
+    distance -= (peak * peak - end_there * end_there) / (2.0 * deceleration)
+    if distance > 0.0 and peak > 0.0:
+        pieces.append(Piece(0.0, distance / peak))
+    if peak > end_there:
+        pieces.append(Piece(-direction * deceleration, (peak - end_there) / deceleration))
+    pieces += to_velocity(direction * end_there, direction * end, acceleration, deceleration)
+    return pieces

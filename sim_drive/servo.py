@@ -95,13 +95,15 @@ class ServoLoop:
         torque_per_volt: float,
         torque_limit_Nm: float = inf,
         negative_torque_limit_Nm: float | None = None,
+        velocity_offset_counts_per_s: float = 0.0,
     ) -> float:
         """Torque command for the coming servo period, in N m.
 
         ``gains`` are K_P, K_I, K_D, K_V, K_F as integers over 256. ``torque_offset_Nm`` is added at the converter's
         input: it shares the 12 bits and the limits with the controller. ``torque_per_volt`` (N m / V) is the
         amplifier's. ``torque_limit_Nm`` and ``negative_torque_limit_Nm`` (both positive numbers; None: the same)
-        narrow the output's limits to whole units within them.
+        narrow the output's limits to whole units within them. ``velocity_offset_counts_per_s`` is added to the demand
+        difference that K_F multiplies.
         """
         gain_p, gain_i, gain_d, gain_v, gain_f = gains
         demand = float(floor(demand_counts + 0.5)) if self._round_error else demand_counts
@@ -113,7 +115,7 @@ class ServoLoop:
             + gain_i * error_sum
             + gain_d * (error - self._error_before)
             - gain_v * (actual_counts - self._position_before)
-            + gain_f * (demand_fed - self._demand_before)
+            + gain_f * (demand_fed - self._demand_before + velocity_offset_counts_per_s / SERVO_RATE_HZ)
         ) / GAIN_SCALE + torque_offset_Nm / (torque_per_volt * VOLT_PER_UNIT)
         maximum = OUTPUT_MAXIMUM
         minimum = OUTPUT_MINIMUM

@@ -63,7 +63,7 @@ class _Probe:
     def _latch(self, edge: int, counts: int, motion: Motion) -> None:
         if not self.armed & edge:
             return
-        self._entries[0 if edge == _STORED_POSITIVE else 1].value = wrap_int32(counts + motion.offset)
+        self._entries[0 if edge == _STORED_POSITIVE else 1].value = wrap_int32(motion.user_position(counts))
         self.status |= edge
         if not self.function & _CONTINUOUS:
             self.armed &= ~edge

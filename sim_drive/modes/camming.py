@@ -17,7 +17,7 @@ _DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
 class Camming(OperationMode):
     """Camming treats the master position as csp does its target, but takes an event-driven RPDO for a cyclic one too.
 
-    The cam is engaged by the first master position, if it does not make the axis jump.
+    The cam is engaged by the first master position, if it does not make the axis jump. Its positions are user units.
     """
 
     __slots__ = ("_is_engaged", "_is_new", "_master_counts", "_master_offset", "_new_master", "_slots")
@@ -88,6 +88,7 @@ class Camming(OperationMode):
             self._is_engaged = True
             motion.show_status()
         is_cyclic = motion.source is not SetPointSource.SDO
-        motion.demand.go_from(start, target, now_ns, motion.period_s, motion.period_s if is_cyclic else 0.0)
+        if not motion.barred or not motion.is_barred(target - start):
+            motion.demand.go_from(start, target, now_ns, motion.period_s, motion.period_s if is_cyclic else 0.0)
         if is_cyclic:
             motion.expect_next(now_ns)

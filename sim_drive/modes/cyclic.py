@@ -21,13 +21,15 @@ class CyclicPosition(OperationMode):
     A target that a SYNC brings into effect is reached in a straight line one interpolation time (60C2h) later. If the
     next one is missing, the line goes on for one more interpolation time, then the position is held; after
     ``missing_set_point_limit`` interpolation times without a set-point the drive faults (8700h). A target by SDO or by
-    an event-driven RPDO acts at once, promises no successor, and so is neither overrun nor guarded.
+    an event-driven RPDO acts at once, promises no successor, and so is neither overrun nor guarded. The position offset
+    60B0h is added to the target; the velocity offset 60B1h is fed forward to the controller, from the next target on.
     """
 
-    __slots__ = ("_is_new", "_new_target", "_offset")
+    __slots__ = ("_is_new", "_new_target", "_offset", "_velocity_offset")
 
     def __init__(self, motion: Motion) -> None:
         super().__init__(motion)
+        self._velocity_offset = motion.entry(objects.VELOCITY_OFFSET)
         self._new_target = 0
         self._is_new = False
         motion.entry(objects.TARGET_POSITION).on_write = self._on_target
@@ -68,6 +70,11 @@ class CyclicPosition(OperationMode):
                 self._follow(value, now_ns, False)
         return None
 
+    def leave(self, now_ns: int) -> None:
+        """Feed no velocity forward any more."""
+        self.is_active = False
+        self.motion.velocity_offset = 0.0
+
     def _follow(self, target: int, now_ns: int, is_cyclic: bool) -> None:
         motion = self.motion
         offset = self._offset.value
@@ -81,9 +88,15 @@ class CyclicPosition(OperationMode):
         demand = motion.demand
         start = demand.at(now_ns)
         shaft = motion.to_shaft(target, start)
+        velocity_offset = self._velocity_offset.value
+        if velocity_offset or motion.velocity_offset:
+            motion.velocity_offset = velocity_offset / motion.velocity_unit
+        if motion.barred and motion.is_barred(shaft - start):
+            return
         overrun_s = motion.period_s if is_cyclic else 0.0
-        if is_cyclic and not low <= target + shaft - start <= high:
-            overrun_s = motion.overrun_s(target, shaft - start)
+        distance = (shaft - start) * motion.unit
+        if is_cyclic and not low <= target + distance <= high:
+            overrun_s = motion.overrun_s(target, distance)
         demand.go_from(start, shaft, now_ns, motion.period_s, overrun_s)
 
 
@@ -144,10 +157,10 @@ class CyclicVelocity(OperationMode):
 
     def _follow(self, target: int, now_ns: int) -> None:
         motion = self.motion
-        wanted = float(target + self._offset.value)
+        wanted = (target + self._offset.value) / motion.velocity_unit
         bound = motion.max_velocity
         velocity = max(-bound, min(bound, wanted))
-        if velocity * self._barred > 0.0:
+        if velocity * self._barred > 0.0 or (motion.barred and motion.is_barred(velocity)):
             return
         self._barred = 0.0
         is_limited = velocity != wanted

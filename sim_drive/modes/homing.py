@@ -99,7 +99,7 @@ class Homing(OperationMode):
     capture input would latch it. The position actual value becomes the home offset 607Ch there, at once, and the axis
     comes to rest where its deceleration takes it. A limit switch on the way to the home switch turns the search around
     once; any other limit switch in the way, or a switch that is not fitted, is a homing error (bit 13). Software
-    position limits do not count while homing.
+    position limits do not count while homing. Directions are the shaft's, whatever the polarity 607Eh.
     """
 
     __slots__ = (
@@ -213,17 +213,32 @@ class Homing(OperationMode):
             self._find_edge(now_ns)
         else:
             self._phase = _Phase.SEARCH
-            self._go(method.search, float(self._speeds[0].value), now_ns)
+            self._go(method.search, self._fast, now_ns)
 
     def _go(self, direction: int, speed: float, now_ns: int) -> None:
         self._direction = direction
         self._speed = speed
         demand = self.motion.demand
-        rate = float(self._acceleration.value)
+        rate = self._rate
         demand.plan(to_velocity(demand.velocity_at(now_ns), direction * speed, rate, rate), now_ns)
 
+    @property
+    def _fast(self) -> float:
+        """Speed of the search for the switch, in counts/s."""
+        return self.motion.rate_of(self._speeds[0].value)
+
+    @property
+    def _slow(self) -> float:
+        """Speed of the search for the edge and the index pulse, in counts/s."""
+        return self.motion.rate_of(self._speeds[1].value)
+
+    @property
+    def _rate(self) -> float:
+        """Homing acceleration in counts/s^2."""
+        return self.motion.rate_of(self._acceleration.value)
+
     def _brake(self, now_ns: int) -> None:
-        self.motion.demand.brake(now_ns, float(self._acceleration.value))
+        self.motion.demand.brake(now_ns, self._rate)
 
     def _end(self, status: HomingStatus, now_ns: int) -> None:
         self.status = status
@@ -238,21 +253,21 @@ class Homing(OperationMode):
         self._has_seen = velocity * (method.final if method.leaves else -method.final) > 0.0
         if method.leaves:
             self._phase = _Phase.EDGE
-            self._go(method.final, float(self._speeds[1].value), now_ns)
+            self._go(method.final, self._slow, now_ns)
         else:
             self._phase = _Phase.CLEAR
-            self._go(-method.final, float(self._speeds[0].value), now_ns)
+            self._go(-method.final, self._fast, now_ns)
 
     def _seek_index(self, counts: int, now_ns: int) -> None:
         method = self._method
         self._home = self._switches.next_index(counts, method.final, self.motion.settings.counts_per_revolution)
         if self._phase is not _Phase.EDGE:
-            self._go(method.final, float(self._speeds[1].value), now_ns)
+            self._go(method.final, self._slow, now_ns)
         self._phase = _Phase.INDEX
 
     def _be_home(self, counts: int, now_ns: int) -> None:
         motion = self.motion
-        motion.offset = self._home_offset.value - counts
+        motion.offset = self._home_offset.value - motion.scaling.position(counts)
         motion.forget_sample()
         self._phase = _Phase.STOP
         self._brake(now_ns)
@@ -267,7 +282,7 @@ class Homing(OperationMode):
                     self._look(now_ns)
             elif motion.demand.is_over(now_ns):
                 if self._number in CURRENT_POSITION:
-                    motion.offset = self._home_offset.value - motion.shaft_counts
+                    motion.offset = self._home_offset.value - motion.scaling.position(motion.shaft_counts)
                     motion.forget_sample()
                 self._is_resting = True
                 self.status = HomingStatus.ATTAINED
@@ -313,7 +328,7 @@ class Homing(OperationMode):
                 self._cross(switch, counts, now_ns)
             else:
                 self._phase = _Phase.EDGE
-                self._go(method.final, float(self._speeds[1].value), now_ns)
+                self._go(method.final, self._slow, now_ns)
 
     def _cross(self, switch: DigitalInput, counts: int, now_ns: int) -> None:
         edge = self._switches.edge(switch, self._before, counts)

@@ -115,9 +115,11 @@ class InterpolatedPosition(OperationMode):
         self._used.value = len(self._records)
         start = motion.demand.at(from_ns)
         shaft = motion.to_shaft(target, start)
-        motion.demand.go_from(start, shaft, from_ns, motion.period_s, 0.0)
+        is_barred = bool(motion.barred) and motion.is_barred(shaft - start)
+        if not is_barred:
+            motion.demand.go_from(start, shaft, from_ns, motion.period_s, 0.0)
         self._is_running = True
-        self._is_moving = shaft != start
+        self._is_moving = shaft != start and not is_barred
         self._due_ns = from_ns + motion.period_ns
 
     def _clear(self) -> None:

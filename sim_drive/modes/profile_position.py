@@ -1,7 +1,7 @@
 """Profile position mode (CiA 402-2, clause 9): the set-point handshake with one set-point in reserve."""
 
 from enum import IntEnum, unique
-from math import floor
+from math import copysign, floor
 from typing import Final, NamedTuple
 
 from drivers import objects
@@ -9,7 +9,8 @@ from sim_drive.cia402 import Controlword, Statusword
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.window import Window
 from sim_drive.motion import Motion, wrap_int32
-from sim_drive.profiles import to_position, to_velocity
+from sim_drive.motion_profile import MotionProfile
+from sim_drive.profiles import to_velocity
 
 _NEW: Final = int(Controlword.NEW_SET_POINT)
 _IMMEDIATE: Final = int(Controlword.CHANGE_IMMEDIATELY)
@@ -35,16 +36,18 @@ class _SetPoint(NamedTuple):
     velocity: float
     acceleration: float
     deceleration: float
+    end_velocity: float
 
 
 class ProfilePosition(OperationMode):
-    """Takes 607Ah, 6081h, 6083h, 6084h at the rising edge of bit 4, and moves in a trapezoid of velocity.
+    """Takes 607Ah, 6081h to 6084h at the rising edge of bit 4, and moves in the profile that 6086h chooses.
 
     Bit 5 lets a set-point act at once; else it waits for the end of the one in work. One can wait: while it does,
     bit 12 stays set, and another is ignored. With bit 9 the one in work is not brought to rest at its target, but
     passed at its profile velocity. A target beyond the software position limits is moved to the limit (bit 11). Bit 10:
     all is done, and the actual position has been within 6067h of the target for 6068h; or, in a halt, the demand rests.
-    After a halt the motion goes on.
+    After a halt the motion goes on. With an end velocity 6082h it passes the target with that velocity, and goes on
+    with it until the next set-point, a halt or a limit.
     """
 
     __slots__ = (
@@ -53,8 +56,10 @@ class ProfilePosition(OperationMode):
         "_direction",
         "_end",
         "_entries",
+        "_goes_on",
         "_is_set",
         "_option",
+        "_profile",
         "_target",
         "_waiting",
         "_was_resting",
@@ -72,10 +77,14 @@ class ProfilePosition(OperationMode):
                 objects.PROFILE_VELOCITY,
                 objects.PROFILE_ACCELERATION,
                 objects.PROFILE_DECELERATION,
+                objects.END_VELOCITY,
             )
         ]
         self._option = motion.entry(objects.POSITIONING_OPTION_CODE)
         self._window = Window(motion.entry(objects.POSITION_WINDOW), motion.entry(objects.POSITION_WINDOW_TIME))
+        self._profile = MotionProfile(motion)
+        self._goes_on = False
+        """A target has been passed with an end velocity, and the motion goes on."""
         self._is_set = False
         self._acknowledge = False
         self._active: _SetPoint | None = None
@@ -93,7 +102,11 @@ class ProfilePosition(OperationMode):
         if not self.is_active:
             return 0
         bits = _ACKNOWLEDGE if self._acknowledge else 0
-        is_reached = self._was_resting if self.motion.is_halted else self._active is None and self._window.is_met
+        is_reached = (
+            self._was_resting
+            if self.motion.is_halted
+            else self._goes_on or (self._active is None and self._window.is_met)
+        )
         return bits | _REACHED if is_reached else bits
 
     def enter(self, now_ns: int) -> None:
@@ -106,6 +119,7 @@ class ProfilePosition(OperationMode):
         self._waiting = None
         self._target = None
         self._direction = 0.0
+        self._goes_on = False
         self._was_resting = False
         self._window.reset()
         motion.slow_down(now_ns)
@@ -129,9 +143,10 @@ class ProfilePosition(OperationMode):
         self.motion.show_status()
 
     def _take(self, value: int, now_ns: int) -> None:
-        target, velocity, acceleration, deceleration = (entry.value for entry in self._entries)
+        target, velocity, acceleration, deceleration, end_velocity = (entry.value for entry in self._entries)
         relative_to = RelativeTo(self._option.value & 3) if value & _RELATIVE else None
-        set_point = _SetPoint(target, relative_to, float(velocity), float(acceleration), float(deceleration))
+        rates = (self.motion.rate_of(value) for value in (velocity, acceleration, deceleration, end_velocity))
+        set_point = _SetPoint(target, relative_to, *rates)
         if self._active is None or value & _IMMEDIATE:
             self._waiting = None
             self._begin(set_point, now_ns)
@@ -150,14 +165,15 @@ class ProfilePosition(OperationMode):
         if set_point.relative_to is RelativeTo.TARGET and self._target is not None:
             target += self._target
         elif set_point.relative_to is RelativeTo.ACTUAL:
-            target += motion.latch(now_ns)[0] + motion.offset
+            target += motion.user_position(motion.latch(now_ns)[0])
         elif set_point.relative_to is not None:
-            target += floor(here + 0.5) + motion.offset
+            target += motion.user_position(floor(here + 0.5))
         self._target = motion.within_limits(wrap_int32(target))
         self._end = motion.to_shaft(self._target, here)
         self._active = set_point
         self._window.reset()
         self._direction = 0.0
+        self._goes_on = False
         if not motion.is_halted:
             self._plan(set_point, now_ns)
 
@@ -165,14 +181,23 @@ class ProfilePosition(OperationMode):
         motion = self.motion
         demand = motion.demand
         self._direction = 0.0
-        pieces = to_position(
-            self._end - demand.at(now_ns),
-            demand.velocity_at(now_ns),
-            min(set_point.velocity, motion.max_velocity),
+        distance = self._end - demand.at(now_ns)
+        if motion.barred and motion.is_barred(distance):
+            return
+        cruise = min(set_point.velocity, motion.max_velocity)
+        limits = self._limits(set_point)
+        end = min(set_point.end_velocity, cruise) if distance else 0.0
+        pieces = self._profile.to_position(distance, cruise, limits, end, now_ns)
+        demand.plan(pieces, now_ns, None if end else self._end)
+        if end:
+            self._direction = copysign(1.0, distance)
+
+    def _limits(self, set_point: _SetPoint) -> tuple[float, float]:
+        motion = self.motion
+        return (
             min(set_point.acceleration, motion.max_acceleration),
             min(set_point.deceleration, motion.max_deceleration),
         )
-        demand.plan(pieces, now_ns, self._end)
 
     def _pass(self, set_point: _SetPoint, now_ns: int) -> None:
         """Do not stop at the target in work."""
@@ -180,19 +205,19 @@ class ProfilePosition(OperationMode):
         demand = motion.demand
         direction = 1.0 if self._end >= demand.at(now_ns) else -1.0
         velocity = demand.velocity_at(now_ns)
-        if velocity * direction < 0.0:
+        if velocity * direction < 0.0 or (motion.barred and motion.is_barred(direction)):
             return
         self._direction = direction
         cruise = min(set_point.velocity, motion.max_velocity)
-        acceleration = min(set_point.acceleration, motion.max_acceleration)
-        deceleration = min(set_point.deceleration, motion.max_deceleration)
-        demand.plan(to_velocity(velocity, direction * cruise, acceleration, deceleration), now_ns)
+        demand.plan(to_velocity(velocity, direction * cruise, *self._limits(set_point)), now_ns)
 
     def on_tick(self, now_ns: int) -> None:
         """See whether the set-point in work is done, and begin the one that waits."""
         motion = self.motion
         demand = motion.demand
         was = self.status_bits
+        if self._goes_on and (motion.stop_at_limits(now_ns) or demand.is_over(now_ns)):
+            self._goes_on = False
         if self._active is not None and not motion.is_halted:
             motion.stop_at_limits(now_ns)
             here = demand.at(now_ns)
@@ -204,12 +229,13 @@ class ProfilePosition(OperationMode):
                 else:
                     self._finish(now_ns)
         self._was_resting = demand.is_over(now_ns)
-        self._window.update(self._end - motion.shaft_counts, now_ns)
+        self._window.update((self._end - motion.shaft_counts) * motion.unit, now_ns)
         if self.status_bits != was:
             motion.show_status()
 
     def _finish(self, now_ns: int) -> None:
         waiting = self._waiting
+        self._goes_on = waiting is None and self._direction != 0.0
         self._active = None
         self._direction = 0.0
         if waiting is not None:

@@ -7,7 +7,7 @@ from sim_drive.cia402 import Statusword
 from sim_drive.modes.base import OperationMode
 from sim_drive.modes.window import Window
 from sim_drive.motion import Motion
-from sim_drive.profiles import to_velocity
+from sim_drive.motion_profile import MotionProfile
 
 _REACHED: Final = int(Statusword.TARGET_REACHED)
 _SPEED_ZERO: Final = int(Statusword.SPEED_ZERO)
@@ -22,7 +22,7 @@ class ProfileVelocity(OperationMode):
     6070h. A software position limit (bit 11) is kept until 60FFh leads away from it.
     """
 
-    __slots__ = ("_barred", "_planned_target", "_standing", "_target", "_window")
+    __slots__ = ("_barred", "_planned_target", "_profile", "_standing", "_target", "_window")
 
     is_ticking = True
 
@@ -31,6 +31,7 @@ class ProfileVelocity(OperationMode):
         self._target = motion.entry(objects.TARGET_VELOCITY)
         self._window = Window(motion.entry(objects.VELOCITY_WINDOW), motion.entry(objects.VELOCITY_WINDOW_TIME))
         self._standing = Window(motion.entry(objects.VELOCITY_THRESHOLD), motion.entry(objects.VELOCITY_THRESHOLD_TIME))
+        self._profile = MotionProfile(motion)
         self._planned_target: float | None = None
         self._barred = 0.0
 
@@ -59,21 +60,21 @@ class ProfileVelocity(OperationMode):
         """Plan anew if the target has changed, and watch windows and limits."""
         motion = self.motion
         demand = motion.demand
-        wanted = float(self._target.value)
+        wanted = self._target.value / motion.velocity_unit
         bound = motion.max_velocity
         target = max(-bound, min(bound, wanted))
         if not motion.is_halted:
-            if target != self._planned_target and not target * self._barred > 0.0:
+            is_barred = target * self._barred > 0.0 or (bool(motion.barred) and motion.is_barred(target))
+            if target != self._planned_target and not is_barred:
                 self._planned_target = target
                 self._barred = 0.0
                 motion.set_internal_bit(_LIMITED, target != wanted)
-                velocity = demand.velocity_at(now_ns)
-                demand.plan(to_velocity(velocity, target, motion.acceleration, motion.deceleration), now_ns)
+                demand.plan(self._profile.to_velocity(target, now_ns), now_ns)
             velocity = demand.velocity_at(now_ns)
             if motion.stop_at_limits(now_ns):
                 self._barred = 1.0 if velocity > 0.0 else -1.0
                 self._planned_target = None
         actual = motion.latch(now_ns)[1]
-        has_changed = self._window.update(wanted - actual, now_ns)
-        if self._standing.update(actual, now_ns) or has_changed:
+        has_changed = self._window.update((wanted - actual) * motion.velocity_unit, now_ns)
+        if self._standing.update(actual * motion.velocity_unit, now_ns) or has_changed:
             motion.show_status()

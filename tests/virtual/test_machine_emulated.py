@@ -50,6 +50,7 @@ class FakeDrive:
         self.latch: Latch = no_latch
         self.position_demand_counts = 0.0
         self.torque_offset_Nm = 0.0
+        self.velocity_offset = 0.0
         self.torque_demand_Nm: float | None = None
         self.torque_limit_Nm = 4.5
         self.negative_torque_limit_Nm = 4.5
