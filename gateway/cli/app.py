@@ -9,6 +9,7 @@ from gateway.cli.animation_command import ANIMATE_EPILOG, animate
 from gateway.cli.cam_commands import CHECK_EPILOG, COMPILE_EPILOG, DOWNLOAD_EPILOG, check, compile_command, download
 from gateway.cli.doctor_command import DOCTOR_EPILOG, doctor
 from gateway.cli.run_commands import DEMO_EPILOG, RUN_EPILOG, demo, run
+from gateway.cli.synthesis_commands import SYNTHESIZE_EPILOG, synthesize
 from gateway.cli.terminal import errors_answered
 from gateway.cli.watch_commands import MONITOR_EPILOG, REPORT_EPILOG, monitor_command, report
 
@@ -24,6 +25,7 @@ app.command("compile", epilog=COMPILE_EPILOG)(compile_command)
 app.command("run", epilog=RUN_EPILOG)(run)
 app.command("report", epilog=REPORT_EPILOG)(report)
 app.command("download", epilog=DOWNLOAD_EPILOG)(download)
+app.command("synthesize", epilog=SYNTHESIZE_EPILOG)(synthesize)
 app.command("animate", epilog=ANIMATE_EPILOG)(animate)
 app.command("doctor", epilog=DOCTOR_EPILOG)(doctor)
 app.command("monitor", epilog=MONITOR_EPILOG)(monitor_command)

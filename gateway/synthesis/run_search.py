@@ -22,7 +22,7 @@ MAXIMUM_STARTS: Final = 1024
 MINIMUM_BUDGET: Final = 100
 MAXIMUM_BUDGET: Final = 1_000_000_000
 MAXIMUM_SEED: Final = 2**32 - 1
-_SLICES_A_START: Final = 20
+_SLICES_A_START: Final = 10
 _LEAST_SLICE: Final = 200
 _POLL_S: Final = 0.2
 
@@ -189,8 +189,7 @@ class SearchRun:
                     settings.population,
                     start.state,
                     settings.slice_evaluations,
-                ),
-                start.evaluations,
+                )
             )
 
     def _take(self, result: SliceResult) -> None:

@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 import tempfile
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NoReturn, cast
@@ -41,12 +41,18 @@ _SEAL: Final = "sha256"
 Document = dict[str, Any]
 
 
-def write_state_file(path: Path, status: SearchStatus, template: str) -> None:
-    """Write where a search stands, in one step. ``template``: the text of the configuration its machine came from.
+@dataclass(frozen=True, slots=True, eq=False)
+class SavedSearch:
+    """A search as it stood. ``template``: the text of the configuration that its machine is made from."""
 
-    Raises OSError.
-    """
-    document = status_document(status, template)
+    status: SearchStatus
+    template: str
+    is_speed_fixed: bool = False
+
+
+def write_state_file(path: Path, saved: SavedSearch) -> None:
+    """Write where a search stands, in one step. Raises OSError."""
+    document = saved_document(saved)
     temporary: Path | None = None
     try:
         with tempfile.NamedTemporaryFile(
@@ -64,8 +70,8 @@ def write_state_file(path: Path, status: SearchStatus, template: str) -> None:
         raise
 
 
-def read_state_file(path: Path) -> tuple[SearchStatus, str]:
-    """Where a search stood, and the text of its template. Raises UsageError for a file that is not whole."""
+def read_state_file(path: Path) -> SavedSearch:
+    """Where a search stood. Raises UsageError for a file that is not whole."""
     try:
         with path.open("rb") as file:
             data = file.read(MAXIMUM_FILE_BYTES + 1)
@@ -79,12 +85,12 @@ def read_state_file(path: Path) -> tuple[SearchStatus, str]:
         raise UsageError(f"{path}: truncated or no file of an interrupted search") from None
     if not isinstance(document, dict) or cast("Document", document).get("format") != FORMAT:
         raise UsageError(f"{path}: no file of an interrupted search (its format is not '{FORMAT}')")
-    return parse_status(cast("Document", document), str(path))
+    return parse_saved(cast("Document", document), str(path))
 
 
-def status_document(status: SearchStatus, template: str) -> Document:
+def saved_document(saved: SavedSearch) -> Document:
     """Where a search stands as plain JSON values, sealed."""
-    settings = status.settings
+    settings = saved.status.settings
     document: Document = {
         "format": FORMAT,
         "version": VERSION,
@@ -93,15 +99,16 @@ def status_document(status: SearchStatus, template: str) -> Document:
         "budget": settings.budget,
         "population": settings.population,
         "task": task_document(settings.task),
-        "template": template,
-        "starts": [_start_document(start) for start in status.starts],
+        "template": saved.template,
+        "is_speed_fixed": saved.is_speed_fixed,
+        "starts": [_start_document(start) for start in saved.status.starts],
     }
     document[_SEAL] = _seal(document)
     return document
 
 
-def parse_status(document: Document, source: str) -> tuple[SearchStatus, str]:
-    """The inverse of `status_document`. Raises UsageError."""
+def parse_saved(document: Document, source: str) -> SavedSearch:
+    """The inverse of `saved_document`. Raises UsageError."""
     if document.get("version") != VERSION:
         raise UsageError(f"{source}: version {str(document.get('version'))[:20]}, only {VERSION} is known")
     try:
@@ -116,7 +123,7 @@ def parse_status(document: Document, source: str) -> tuple[SearchStatus, str]:
             starts=len(starts),
             population=None if document["population"] is None else int(document["population"]),
         )
-        return SearchStatus(settings, starts), str(document["template"])
+        return SavedSearch(SearchStatus(settings, starts), str(document["template"]), bool(document["is_speed_fixed"]))
     except UsageError:
         raise
     except (KeyError, TypeError, ValueError, IndexError, AttributeError, RecursionError, binascii.Error) as error:

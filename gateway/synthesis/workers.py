@@ -20,9 +20,6 @@ MAXIMUM_RESTARTS: Final = 5
 CONNECT_TIMEOUT_S: Final = 10
 """How long a dask scheduler may take to answer at first."""
 
-Handed = tuple[SearchSlice, int]
-"""A slice, and the evaluations of its start before it."""
-
 
 class WorkersLostError(GatewayError):
     """There is nobody left to run slices."""
@@ -36,7 +33,7 @@ class Workers(Protocol):
         """How many slices to hand in at once."""
         ...
 
-    def submit(self, wanted: SearchSlice, done_before: int) -> None:
+    def submit(self, wanted: SearchSlice) -> None:
         """Hand in a slice."""
         ...
 
@@ -56,20 +53,20 @@ class InProcess:
     """No other process: `collect` runs one slice."""
 
     def __init__(self) -> None:
-        self._waiting: list[Handed] = []
+        self._waiting: list[SearchSlice] = []
 
     @property
     def capacity(self) -> int:
         """One."""
         return 1
 
-    def submit(self, wanted: SearchSlice, done_before: int) -> None:
+    def submit(self, wanted: SearchSlice) -> None:
         """See `Workers`."""
-        self._waiting.append((wanted, done_before))
+        self._waiting.append(wanted)
 
     def collect(self, timeout_s: float) -> list[SliceResult]:
         """See `Workers`."""
-        return [run_slice(*self._waiting.pop(0))] if self._waiting else []
+        return [run_slice(self._waiting.pop(0))] if self._waiting else []
 
     def close(self) -> None:
         """See `Workers`."""
@@ -89,7 +86,7 @@ class LocalProcesses:
         self._count = count
         self._restarts = 0
         self._pool = self._new_pool()
-        self._running: dict[Future[SliceResult], Handed] = {}
+        self._running: dict[Future[SliceResult], SearchSlice] = {}
 
     def _new_pool(self) -> ProcessPoolExecutor:
         context = multiprocessing.get_context("spawn")
@@ -106,18 +103,18 @@ class LocalProcesses:
         processes: Any = getattr(self._pool, "_processes", None) or {}
         return [int(number) for number in processes]
 
-    def submit(self, wanted: SearchSlice, done_before: int) -> None:
+    def submit(self, wanted: SearchSlice) -> None:
         """See `Workers`."""
         try:
-            self._running[self._pool.submit(run_slice, wanted, done_before)] = (wanted, done_before)
+            self._running[self._pool.submit(run_slice, wanted)] = wanted
         except BrokenProcessPool:
-            self._restart([(wanted, done_before)])
+            self._restart([wanted])
 
     def collect(self, timeout_s: float) -> list[SliceResult]:
         """See `Workers`."""
         done, _ = wait(self._running, timeout_s, FIRST_COMPLETED)
         results: list[SliceResult] = []
-        lost: list[Handed] = []
+        lost: list[SearchSlice] = []
         for future in done:
             handed = self._running.pop(future)
             try:
@@ -128,7 +125,7 @@ class LocalProcesses:
             self._restart(lost)
         return results
 
-    def _restart(self, lost: list[Handed]) -> None:
+    def _restart(self, lost: list[SearchSlice]) -> None:
         self._restarts += 1
         if self._restarts > MAXIMUM_RESTARTS:
             raise WorkersLostError(f"worker processes have died {self._restarts} times")
@@ -136,8 +133,8 @@ class LocalProcesses:
         self._running.clear()
         self._pool.shutdown(wait=False, cancel_futures=True)
         self._pool = self._new_pool()
-        for wanted, done_before in lost:
-            self.submit(wanted, done_before)
+        for wanted in lost:
+            self.submit(wanted)
 
     def close(self) -> None:
         """See `Workers`."""
@@ -162,7 +159,7 @@ class DaskCluster:
         except (OSError, ValueError, TimeoutError) as error:
             raise GatewayError(f"--dask {address}: no scheduler answers ({str(error)[:120]})") from None
         self._address = address
-        self._running: dict[Any, Handed] = {}
+        self._running: dict[Any, SearchSlice] = {}
         self._deaths = 0
 
     @property
@@ -171,9 +168,9 @@ class DaskCluster:
         threads: dict[str, int] = self._client.nthreads()
         return max(2 * sum(threads.values()), 1)
 
-    def submit(self, wanted: SearchSlice, done_before: int) -> None:
+    def submit(self, wanted: SearchSlice) -> None:
         """See `Workers`."""
-        self._running[self._client.submit(run_slice, wanted, done_before, pure=False)] = (wanted, done_before)
+        self._running[self._client.submit(run_slice, wanted, pure=False)] = wanted
 
     def collect(self, timeout_s: float) -> list[SliceResult]:
         """See `Workers`."""
@@ -198,7 +195,7 @@ class DaskCluster:
             self._deaths += 1
             if self._deaths > MAXIMUM_RESTARTS or self._client.status != "running":
                 raise WorkersLostError(f"--dask {self._address}: {str(error).splitlines()[0][:160]}") from None
-            self.submit(*handed)
+            self.submit(handed)
             return None
 
     def close(self) -> None:

@@ -1,0 +1,75 @@
+"""Which mechanism of a finished search is taken, and whether it is of use."""
+
+from math import degrees
+from typing import Final
+
+import numpy as np
+
+from gateway.errors import UsageError
+from gateway.synthesis.run_search import SearchStatus
+from gateway.synthesis.search_slice import Found
+from mechanism.synthesis.candidate import Candidate
+from mechanism.synthesis.search import Method
+from mechanism.synthesis.task import SynthesisTask, Term
+
+BEST: Final = "best"
+KNEE: Final = "knee"
+_FAULT_TERMS: Final = frozenset({Term.TIMING, Term.MOBILITY, Term.SINGULARITY, Term.KEEP_OUT})
+
+
+def choose(status: SearchStatus, choice: str | None, front: tuple[Found, ...]) -> Found:
+    """The best by weighted sum, or of a Pareto front: "best", "knee" (nearest to the best of every term), or a number.
+
+    The knee is looked for among the mechanisms without faults, if there are any. Raises UsageError.
+    """
+    best = status.best
+    if best is None:
+        raise UsageError("the search was interrupted before it had found anything")
+    if choice is None or (choice == BEST and not front):
+        return best if status.settings.method is not Method.PARETO or not front else _knee(status.settings.task, front)
+    if status.settings.method is not Method.PARETO:
+        raise UsageError(f"--pareto {choice[:20]}: only --method pareto has a front to choose from")
+    if choice == BEST:
+        return min(front, key=lambda found: found.objective)
+    if choice == KNEE:
+        return _knee(status.settings.task, front)
+    if not (choice.isascii() and choice.isdigit() and 1 <= int(choice) <= len(front)):
+        raise UsageError(f"--pareto {choice[:20]}: neither knee nor best nor a number from 1 to {len(front)}")
+    return front[int(choice) - 1]
+
+
+def check_choice(choice: str | None, method: Method) -> None:
+    """Refuse a choice that no outcome can meet before the search begins. Raises UsageError."""
+    if choice is None:
+        return
+    if method is not Method.PARETO:
+        raise UsageError(f"--pareto {choice[:20]}: only --method pareto has a front to choose from")
+    if choice not in {BEST, KNEE} and not (choice.isascii() and choice.isdigit() and int(choice) >= 1):
+        raise UsageError(f"--pareto {choice[:20]}: neither knee nor best nor a number from 1 on")
+
+
+def _knee(task: SynthesisTask, front: tuple[Found, ...]) -> Found:
+    faults = [index for index, entry in enumerate(task.terms) if entry.term in _FAULT_TERMS]
+    sound = [found for found in front if not any(found.terms[index] > 0.0 for index in faults)] or list(front)
+    counted = [index for index, entry in enumerate(task.terms) if entry.weight > 0.0]
+    costs = np.array([found.terms for found in sound])[:, counted]
+    span = np.ptp(costs, axis=0)
+    scaled = (costs - costs.min(axis=0)) / np.where(span > 0.0, span, 1.0)
+    return sound[int(np.argmin(np.sum(scaled**2, axis=1)))]
+
+
+def missed_tolerance(candidate: Candidate) -> str | None:
+    """A sentence about the point that misses its tolerance most, None where every point keeps its own."""
+    tolerances = candidate.task.tolerances
+    if tolerances is None:
+        return None
+    track = candidate.servo_motion()
+    beyond = track.structural_error - tolerances
+    worst = int(np.argmax(beyond))
+    if not beyond[worst] > 1e-9:
+        return None
+    return (
+        f"no mechanism found within the bounds keeps the tolerances: the term {Term.STRUCTURAL_ERROR.value} cannot be "
+        f"met (point {worst + 1}, theta2 = {degrees(float(track.theta2[worst])):.2f} deg, is missed by "
+        f"{float(track.structural_error[worst]) * 1e3:.3f} mm, tolerance {float(tolerances[worst]) * 1e3:.3f} mm)"
+    )
