@@ -8,6 +8,7 @@ import numpy as np
 from gateway.errors import UsageError
 from gateway.synthesis.run_search import SearchStatus
 from gateway.synthesis.search_slice import Found
+from mechanism.errors import CurveError
 from mechanism.synthesis.candidate import Candidate
 from mechanism.synthesis.search import Method
 from mechanism.synthesis.task import SynthesisTask, Term
@@ -17,24 +18,24 @@ KNEE: Final = "knee"
 _FAULT_TERMS: Final = frozenset({Term.TIMING, Term.MOBILITY, Term.SINGULARITY, Term.KEEP_OUT})
 
 
-def choose(status: SearchStatus, choice: str | None, front: tuple[Found, ...]) -> Found:
-    """The best by weighted sum, or of a Pareto front: "best", "knee" (nearest to the best of every term), or a number.
+def choose(status: SearchStatus, choice: str | None, front: tuple[Found, ...], error_limit_m: float) -> Found:
+    """The best by weighted sum, or of a Pareto front: "best", "knee", or a number from 1 on. Raises UsageError.
 
-    The knee is looked for among the mechanisms without faults, if there are any. Raises UsageError.
+    The knee is, among the mechanisms without faults that meet every point (within its tolerance, or the limit in m),
+    the one nearest to the best of every term; with none that does, the one with the least structural error.
     """
     best = status.best
     if best is None:
         raise UsageError("the search was interrupted before it had found anything")
-    if choice is None or (choice == BEST and not front):
-        return best if status.settings.method is not Method.PARETO or not front else _knee(status.settings.task, front)
-    if status.settings.method is not Method.PARETO:
-        raise UsageError(f"--pareto {choice[:20]}: only --method pareto has a front to choose from")
+    check_choice(choice, status.settings.method)
+    if not front:
+        return best
+    if choice is None or choice == KNEE:
+        return _knee(status.settings.task, front, error_limit_m)
     if choice == BEST:
         return min(front, key=lambda found: found.objective)
-    if choice == KNEE:
-        return _knee(status.settings.task, front)
-    if not (choice.isascii() and choice.isdigit() and 1 <= int(choice) <= len(front)):
-        raise UsageError(f"--pareto {choice[:20]}: neither knee nor best nor a number from 1 to {len(front)}")
+    if int(choice) > len(front):
+        raise UsageError(f"--pareto {choice[:20]}: the front has {len(front)} mechanisms")
     return front[int(choice) - 1]
 
 
@@ -48,14 +49,27 @@ def check_choice(choice: str | None, method: Method) -> None:
         raise UsageError(f"--pareto {choice[:20]}: neither knee nor best nor a number from 1 on")
 
 
-def _knee(task: SynthesisTask, front: tuple[Found, ...]) -> Found:
+def _knee(task: SynthesisTask, front: tuple[Found, ...], error_limit_m: float) -> Found:
     faults = [index for index, entry in enumerate(task.terms) if entry.term in _FAULT_TERMS]
     sound = [found for found in front if not any(found.terms[index] > 0.0 for index in faults)] or list(front)
+    met = [found for found in sound if _greatest_miss(found.candidate(task), error_limit_m) <= 0.0]
+    if not met:
+        return min(sound, key=lambda found: _greatest_miss(found.candidate(task), error_limit_m))
     counted = [index for index, entry in enumerate(task.terms) if entry.weight > 0.0]
-    costs = np.array([found.terms for found in sound])[:, counted]
+    costs = np.array([found.terms for found in met])[:, counted]
     span = np.ptp(costs, axis=0)
     scaled = (costs - costs.min(axis=0)) / np.where(span > 0.0, span, 1.0)
-    return sound[int(np.argmin(np.sum(scaled**2, axis=1)))]
+    return met[int(np.argmin(np.sum(scaled**2, axis=1)))]
+
+
+def _greatest_miss(candidate: Candidate, error_limit_m: float) -> float:
+    """By how much (m) the worst point is missed beyond its tolerance, or beyond the limit where there are none."""
+    tolerances = candidate.task.tolerances
+    try:
+        error = candidate.servo_motion().structural_error
+    except CurveError:
+        return float("inf")
+    return float((error - (error_limit_m if tolerances is None else tolerances)).max())
 
 
 def missed_tolerance(candidate: Candidate) -> str | None:

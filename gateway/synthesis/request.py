@@ -21,10 +21,10 @@ from mechanism.synthesis.task import Bounds, SynthesisTask, Timing
 
 DEFAULT_POINTS: Final = 36
 DEFAULT_BUDGET: Final = {
-    Method.PAPER: 20_000,
-    Method.DIFFERENTIAL_EVOLUTION: 200_000,
-    Method.CMA_ES: 200_000,
-    Method.PARETO: 40_000,
+    Method.PAPER: 10_000,
+    Method.DIFFERENTIAL_EVOLUTION: 60_000,
+    Method.CMA_ES: 20_000,
+    Method.PARETO: 20_000,
 }
 """Evaluations a start."""
 DEFAULT_STARTS: Final = {

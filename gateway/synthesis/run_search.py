@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from gateway.errors import UsageError
 from gateway.synthesis.search_slice import Found, SearchSlice, SliceResult
 from gateway.synthesis.workers import Workers
-from mechanism.synthesis.search import Method, Phase
+from mechanism.synthesis.search import LEAST_BUDGET, Method, Phase
 from mechanism.synthesis.task import SynthesisTask
 
 Float = NDArray[np.floating[Any]]
 
 MAXIMUM_STARTS: Final = 1024
-MINIMUM_BUDGET: Final = 100
 MAXIMUM_BUDGET: Final = 1_000_000_000
 MAXIMUM_SEED: Final = 2**32 - 1
 _SLICES_A_START: Final = 10
@@ -41,9 +40,9 @@ class SearchSettings:
     def __post_init__(self) -> None:
         for name, value, low, high in (
             ("--seed", self.seed, 0, MAXIMUM_SEED),
-            ("--budget", self.budget, MINIMUM_BUDGET, MAXIMUM_BUDGET),
+            ("--budget", self.budget, LEAST_BUDGET, MAXIMUM_BUDGET),
             ("--starts", self.starts, 1, MAXIMUM_STARTS),
-            ("--population", self.population or 40, 8, 100_000),
+            ("--population", self.population or 40, 4, 100_000),
         ):
             if not low <= value <= high:
                 raise UsageError(f"{name} {value}, bound {low} to {high}")

@@ -12,7 +12,7 @@ from gateway.session import StopRequest, StopSwitch
 from gateway.synthesis.choice import choose, missed_tolerance
 from gateway.synthesis.linkage_motion import LinkageMotion, linkage_motion
 from gateway.synthesis.machine_files import MachineFiles, write_machine
-from gateway.synthesis.report import synthesis_document, write_synthesis_report
+from gateway.synthesis.report import synthesis_document, torque_figures, write_synthesis_report
 from gateway.synthesis.report_plots import SynthesisData
 from gateway.synthesis.run_search import SearchRun, SearchStatus
 from gateway.synthesis.search_slice import Found
@@ -50,7 +50,7 @@ def resume_path_of(output: Path) -> Path:
 
 @dataclass(slots=True)
 class SynthesisSession:
-    """Carries a synthesis through. ``is_speed_fixed``: the machine may not be slowed down to keep its drives' limits."""
+    """Carries a synthesis through. ``is_speed_fixed``: the machine may not be slowed to keep its drives' limits."""
 
     status: SearchStatus
     template: GatewayConfig
@@ -114,13 +114,13 @@ class SynthesisSession:
         term that cannot be met), OSError.
         """
         front = self.status.front()
-        found = choose(self.status, choice, front)
+        found = choose(self.status, choice, front, self.template.motion.structural_error_limit_mm * 1e-3)
         candidate = found.candidate(self.status.settings.task)
         candidate.require_feasible()
         machine = write_machine(self.output, candidate, self.template, self._remark(), self.is_speed_fixed)
         motion = linkage_motion(machine.config, REPORT_SAMPLES)
         outcome = SynthesisOutcome(
-            self.status, candidate, machine, motion, front, report_folder, _problems(candidate, machine)
+            self.status, candidate, machine, motion, front, report_folder, _problems(candidate, machine, motion)
         )
         if report_folder is not None:
             data = SynthesisData(motion, self.status, candidate, front, found if front else None)
@@ -141,7 +141,7 @@ class _AbandonedError(Exception):
     """The user does not want to wait for the slices in hand."""
 
 
-def _problems(candidate: Candidate, machine: MachineFiles) -> tuple[str, ...]:
+def _problems(candidate: Candidate, machine: MachineFiles, motion: LinkageMotion) -> tuple[str, ...]:
     missed = missed_tolerance(candidate)
     problems = [] if missed is None else [missed]
     for error in machine.violations:
@@ -150,4 +150,12 @@ def _problems(candidate: Candidate, machine: MachineFiles) -> tuple[str, ...]:
                 problems.append(f"the term {Term.STRUCTURAL_ERROR.value} cannot be met within the bounds: {error}")
         else:
             problems.append(str(error))
+    axes = zip(machine.config.axis_names, machine.config.ordered_axes, torque_figures(motion), strict=True)
+    for name, axis, (_, low, high, rms) in axes:
+        for what, value, limit in (
+            ("peaks at", max(-low, high), axis.emulation.torque_limit_Nm),
+            ("is in the RMS", rms, axis.rated_torque_Nm),
+        ):
+            if value > limit:
+                problems.append(f"axes.{name}: the torque over the cycle {what} {value:.3f} N m, bound {limit:g} N m")
     return tuple(problems)

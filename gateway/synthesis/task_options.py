@@ -7,6 +7,7 @@ import numpy as np
 
 from gateway.errors import UsageError
 from mechanism.errors import ParameterError
+from mechanism.synthesis.pareto import PARETO_TERMS
 from mechanism.synthesis.search import Method
 from mechanism.synthesis.task import (
     PAPER_TERMS,
@@ -32,15 +33,31 @@ TERM_NAMES: Final = {slug(term): term for term in Term}
 VARIABLE_NAMES: Final = {variable.name.lower(): variable for variable in Variable}
 
 
+_USUAL_WEIGHTS: Final = {
+    Term.STRUCTURAL_ERROR: 100.0,
+    Term.MOBILITY: 1e6,
+    Term.SWEPT_AREA: 0.75,
+    Term.HARMONIC_CONTENT: 0.5,
+    Term.SINGULARITY: 1e6,
+    Term.PEAK_TORQUE: 1000.0,
+}
+"""The paper's terms as it weighs them but for two - the curve comes first, and a linkage that cannot move or be driven
+is none - and the servo motor's torque, which the swept area alone lets grow beyond any drive."""
+_FAULT_WEIGHT: Final = 1e6
+
+
 def default_weights(method: Method, timing: Timing, has_zones: bool) -> dict[Term, float]:
-    """The paper's four terms; for every other method also what makes a mechanism that can be driven and run."""
-    weights = {entry.term: entry.weight for entry in PAPER_TERMS}
-    if method is not Method.PAPER:
-        weights[Term.SINGULARITY] = 1.0
+    """What a method weighs if nothing else is asked for: the paper's the paper's terms, with the paper's weights."""
+    if method is Method.PAPER:
+        weights = {entry.term: entry.weight for entry in PAPER_TERMS}
+    elif method is Method.PARETO:
+        weights = {entry.term: entry.weight for entry in PARETO_TERMS}
+    else:
+        weights = dict(_USUAL_WEIGHTS)
     if timing is Timing.FREE:
-        weights[Term.TIMING] = 1.0
+        weights[Term.TIMING] = _FAULT_WEIGHT
     if has_zones:
-        weights[Term.KEEP_OUT] = 1.0
+        weights[Term.KEEP_OUT] = _FAULT_WEIGHT
     return weights
 
 
