@@ -36,13 +36,14 @@ VARIABLE_NAMES: Final = {variable.name.lower(): variable for variable in Variabl
 _USUAL_WEIGHTS: Final = {
     Term.STRUCTURAL_ERROR: 100.0,
     Term.MOBILITY: 1e6,
-    Term.SWEPT_AREA: 0.75,
+    Term.SWEPT_AREA: 0.1,
     Term.HARMONIC_CONTENT: 0.5,
+    Term.TRANSMISSION_ANGLE: 5000.0,
     Term.SINGULARITY: 1e6,
-    Term.PEAK_TORQUE: 1000.0,
+    Term.PEAK_TORQUE: 3000.0,
 }
-"""The paper's terms as it weighs them but for two - the curve comes first, and a linkage that cannot move or be driven
-is none - and the servo motor's torque, which the swept area alone lets grow beyond any drive."""
+"""The curve comes first, and a linkage that cannot move or be driven is none. The less the servo sweeps, the more its
+errors are magnified and the heavier it works: so transmission angle and torque stand against the swept area."""
 _FAULT_WEIGHT: Final = 1e6
 
 
