@@ -37,6 +37,11 @@ def wrap_int32(value: int) -> int:
     return ((value + _HALF) % _WRAP) - _HALF
 
 
+def _wrap(parts: float, denominator: int) -> float:
+    """As ``wrap_int32``, for a number of ``denominator``-ths."""
+    return (parts + _HALF * denominator) % (_WRAP * denominator) - _HALF * denominator
+
+
 @unique
 class SetPointSource(IntEnum):
     """By what way a value comes into the dictionary."""
@@ -318,7 +323,9 @@ class Motion(ABC):
         whole = floor(here)
         if self.unit == 1.0:
             return wrap_int32(whole + self.offset) + here - whole
-        return wrap_int32(self.user_position(whole)) + (here - whole) * self.unit
+        scaling = self.scaling
+        parts = _wrap(whole * scaling.numerator + self.offset * scaling.denominator, scaling.denominator)
+        return parts / scaling.denominator + (here - whole) * self.unit
 
     def brake(self, deceleration: float, now_ns: int) -> None:
         """Ramp the demand down to rest; more steeply, if it would else come to rest beyond a software limit 607Dh."""
@@ -385,5 +392,7 @@ class Motion(ABC):
         if self.unit == 1.0:
             distance = position - self.offset - reference
             return reference + ((distance + _HALF) % _WRAP) - _HALF
-        distance = position - self.user_position(reference)
-        return reference + (((distance + _HALF) % _WRAP) - _HALF) / self.unit
+        # In parts of a user unit, so that the answer does not depend on where the demand is.
+        scaling = self.scaling
+        parts = (position - self.offset) * scaling.denominator - reference * scaling.numerator
+        return reference + _wrap(parts, scaling.denominator) / scaling.numerator
