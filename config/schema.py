@@ -69,6 +69,8 @@ class MotionSection(Model):
     machine_cycles: Annotated[int, Field(ge=1, le=1_000_000)] = 10
     ramp_acceleration_rad_per_s2: Positive
     ramp_jerk_rad_per_s3: Positive
+    approach_speed_rad_per_s: Positive = 0.5
+    """Of the faster axis on the slow way onto the cam, from wherever the linkage stands."""
     cam_points: Annotated[int, Field(ge=64, le=65536)] = 1024
     structural_error_limit_mm: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.5
 
@@ -413,6 +415,12 @@ class GatewayConfig(Model):
                 f"motion.ramp_jerk_rad_per_s3: {motion.ramp_jerk_rad_per_s3:g} is above "
                 f"axes.{name}.limits.jerk_rad_per_s3 {limits.jerk_rad_per_s3:g}"
             )
+        for other, axis in self.axes.items():
+            if motion.approach_speed_rad_per_s > axis.limits.velocity_rad_per_s:
+                raise ValueError(
+                    f"motion.approach_speed_rad_per_s: {motion.approach_speed_rad_per_s:g} is above "
+                    f"axes.{other}.limits.velocity_rad_per_s {axis.limits.velocity_rad_per_s:g}"
+                )
         if limits.position_deg is not None:
             raise ValueError(
                 f"axes.{name}.limits.position_deg: the master turns without end and can have no such limit"

@@ -15,6 +15,7 @@ from drivers.frame import Frame
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, Master, NodeStateChanged, Procedure
 from drivers.nmt import SYNC_COB_ID, NmtCommand, NmtState
 from drivers.node import Event
+from gateway.approach import Approach
 from gateway.commissioning import (
     NetworkSettings,
     NodeSettings,
@@ -31,6 +32,8 @@ from gateway.learning import LearnedTorque
 from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.sample import Phase
 from gateway.sdo_pacing import SdoPacing
+from mechanism.approach import Point
+from mechanism.errors import MechanismError
 from mechanism.motion import MasterPlan
 
 NS_PER_S: Final = 1_000_000_000
@@ -72,9 +75,11 @@ class GatewayCore:
         guard: Guard,
         is_homing_again: bool = False,
         sdo_frames_a_cycle: int = 2,
+        approach: Approach | None = None,
     ) -> None:
         """``is_homing_again``: home the axes where they stand even if their drives are homed already.
 
+        ``approach``: how a machine that does not stand where the plan begins gets onto its cam; None refuses it.
         ``sdo_frames_a_cycle``: requests and responses that may be on the bus in each cycle.
         """
         self.loop = loop
@@ -91,6 +96,9 @@ class GatewayCore:
         self._guard = guard
         self._is_homing_again = is_homing_again
         self._sdo_pacing = SdoPacing(sdo_frames_a_cycle)
+        self._approach = approach
+        self._way: tuple[Point, ...] = ()
+        """Corners of the approach; none where the machine stands at the plan's start."""
         self._is_stop_requested = False
         self._is_watching_nodes = False
         """Set once the drives are configured: one that restarts or falls silent after that is not what it was."""
@@ -305,9 +313,12 @@ class GatewayCore:
             if abs(axis.channel.actual - target) > window:
                 problems.append(
                     f"axis {axis.node.name}: stands at {axis.channel.actual} counts, the cam starts at {target}, "
-                    f"which is more than {window} counts away; bring the linkage to its home position"
+                    f"which is more than {window} counts away; bring the linkage to its home position, or start from "
+                    "where it stands (--from-here)"
                 )
-        if problems:
+        if problems and self._approach is not None:
+            self._way = self._find_way(self._approach)
+        elif problems:
             raise CommissioningError(problems)
         # Until now the target of each axis was its actual position; from here on it is held where it then is.
         yield from for_all(self._nodes, lambda node: self.power.enable(self._axis(node)))
@@ -319,7 +330,9 @@ class GatewayCore:
         yield from self.master.pause(SETTLE_S)
         loop, demand, guard = self.loop, self._demand, self._guard
         # What has called for a stop since the drives were commissioned has called for no motion at all.
-        if guard.reaction is None and not self._is_stop_requested:
+        if self._may_move() and self._approach is not None and self._way:
+            yield from self._go_onto_cam(self._approach)
+        if self._may_move():
             self._step("moving")
             demand.begin(self._plan, [axis.channel.target for axis in self._axes])
             loop.follow(demand, demand.observer)
@@ -332,6 +345,30 @@ class GatewayCore:
             self._step("quick stop")
         else:
             yield from self.master.pause(SETTLE_S)
+
+    def _may_move(self) -> bool:
+        return self._guard.reaction is None and not self._is_stop_requested
+
+    def _find_way(self, approach: Approach) -> tuple[Point, ...]:
+        """From where the linkage stands onto the cam; raises CommissioningError with a sentence if there is no way."""
+        theta2, theta5 = (axis.channel.units.angle(axis.channel.actual) for axis in self._axes)
+        try:
+            return approach.field.path(theta2, theta5)
+        except MechanismError as error:
+            raise CommissioningError([str(error)]) from None
+
+    def _go_onto_cam(self, approach: Approach) -> Procedure[None]:
+        self._step("approaching the cam")
+        loop, demand = self.loop, approach.demand
+        demand.begin(self._way, [axis.channel.target for axis in self._axes])
+        loop.follow(demand)
+        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
+            if self._is_stop_requested:
+                loop.controlled_stop()
+            yield self.master.now_ns + NS_PER_S
+        if self._may_move():
+            yield from self.master.pause(SETTLE_S)
+            self._plan = approach.plan_from(self._way[-1][0])
 
     def _stands(self) -> Procedure[bool]:
         """Wait until no axis moves any more."""

@@ -247,7 +247,8 @@ class CyclicLoop:
             return
         if self.phase is not Phase.QUICK_STOP:
             self.is_guarding_enabled = False
-            is_coupled = self._coupled_stop is not None and self._demand is not None
+            is_on_cam = self._demand is not None and Phase.RAMP_UP <= self.phase <= Phase.CONTROLLED_STOP
+            is_coupled = is_on_cam and self._coupled_stop is not None
             # It begins with the actual values of the cycle that is closed next.
             self._is_coupled_stop_due = is_coupled
             self.follow(None)

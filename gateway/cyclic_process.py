@@ -60,6 +60,7 @@ class CyclicJob:
     bit_rate: int | None
     parent_pid: int
     is_homing_again: bool = False
+    is_starting_anywhere: bool = False
     learn: str | None = None
     """File or folder with what has been learned; None leaves it to the configuration."""
 
@@ -177,6 +178,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         job.is_homing_again,
         None if store is None else store.learning(),
         None if has_wire(address) else LATEST_TPDO * config.bus.cycle_us,
+        job.machine_cycles if job.is_starting_anywhere else None,
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

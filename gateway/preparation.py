@@ -10,6 +10,7 @@ import numpy as np
 from config.conversion import closure_at_home, desired_curve, five_bar, home_angles
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
+from gateway.approach import Approach, ApproachDemand, ApproachLimits
 from gateway.commissioning import NetworkSettings, NodeSettings
 from gateway.core import START_WINDOW_RAD, GatewayCore
 from gateway.cycle import AxisChannel, CyclicLoop, SampleSink
@@ -22,6 +23,7 @@ from gateway.reactions import CoupledStop
 from gateway.torque_offsets import build_torque_offsets, torque_violations
 from gateway.units import AxisUnits
 from gateway.watch import AxisLimits, CamWindow, CycleWatch
+from mechanism.approach import ApproachField
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import CamLimitError, MechanismError
@@ -91,8 +93,8 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
     return PreparedRun(config, cam, plan(config, machine_cycles), violations)
 
 
-def plan(config: GatewayConfig, machine_cycles: int | None = None) -> MasterPlan:
-    """The master's plan: from home up to speed, the machine cycles, and down again to the angle where it began.
+def plan(config: GatewayConfig, machine_cycles: int | None = None, start: float | None = None) -> MasterPlan:
+    """The master's plan: from home, or ``start`` (rad), up to speed, the machine cycles, and down again to home.
 
     Homing takes the position where the linkage stands for home, so that a run must end where the next one begins.
     """
@@ -102,7 +104,7 @@ def plan(config: GatewayConfig, machine_cycles: int | None = None) -> MasterPlan
 
     def run(revolutions: float) -> MasterPlan:
         return plan_run(
-            home,
+            home if start is None else start,
             config.speed_rad_per_s,
             revolutions,
             motion.ramp_acceleration_rad_per_s2,
@@ -252,8 +254,12 @@ def build_core(
     is_homing_again: bool = False,
     learning: Learning | None = None,
     tpdo_deadline_us: float | None = None,
+    approach_cycles: int | None = None,
 ) -> GatewayCore:
     """Put the gateway's parts together; see ``gateway.core``.
+
+    ``approach_cycles``: start from anywhere, with so many machine cycles after the approach; None refuses a machine
+    that does not stand where ``run_plan`` begins.
 
     ``learning``: what has been learned before and is to be gone on with; None leaves it to the configuration.
     ``tpdo_deadline_us``: how long after SYNC the TPDOs are waited for; None is what the bus budget leaves.
@@ -292,6 +298,7 @@ def build_core(
         config.motion.ramp_jerk_rad_per_s3,
         build_torque_offsets(config, profile, units, learning),
     )
+    approach = None if approach_cycles is None else build_approach(config, profile, approach_cycles)
     return GatewayCore(
         setups,
         network_settings(config),
@@ -302,4 +309,31 @@ def build_core(
         guard,
         is_homing_again,
         config.bus.sdo_frames_a_cycle,
+        approach,
+    )
+
+
+def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: int) -> Approach:
+    """How a machine gets onto its cam from anywhere, and the run that it then makes.
+
+    Raises mechanism.errors.ApproachError for a cam that has no approach.
+    """
+    position = config.ordered_axes[1].limits.position_deg
+    motion = config.motion
+    return Approach(
+        ApproachField(
+            five_bar(config),
+            closure_at_home(config, desired_curve(config)),
+            profile,
+            config.machine.minimum_transmission_sine,
+            None if position is None else (math.radians(position[0]), math.radians(position[1])),
+        ),
+        ApproachDemand(
+            [axis_units(axis) for axis in config.ordered_axes],
+            config.cycle_s,
+            ApproachLimits(
+                motion.approach_speed_rad_per_s, motion.ramp_acceleration_rad_per_s2, motion.ramp_jerk_rad_per_s3
+            ),
+        ),
+        lambda start: plan(config, machine_cycles, start),
     )

@@ -34,6 +34,8 @@ class Phase(IntEnum):
     CONTROLLED_STOP = 5
     QUICK_STOP = 6
     DISABLED = 7
+    APPROACH = 8
+    """On the slow way onto the cam."""
 
 
 class SampleFlag(IntFlag):

@@ -101,11 +101,13 @@ def run_realtime(
     is_overwriting: bool = False,
     with_frames: bool = False,
     is_homing_again: bool = False,
+    is_starting_anywhere: bool = False,
     learn: Path | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> None:
-    """Carry out a prepared run on a bus and record it; ``with_frames`` also records every frame on the bus.
+    """Carry out a prepared run on a bus and record it; ``with_frames`` also records every frame on the bus,
+    ``is_starting_anywhere`` brings a machine that does not stand at home slowly onto its cam first.
 
     ``learn``: file or folder of what has been learned, see ``gateway.learning_store``; None leaves it to the
     configuration.
@@ -154,6 +156,7 @@ def run_realtime(
             bit_rate=address.bit_rate,
             parent_pid=os.getpid(),
             is_homing_again=is_homing_again,
+            is_starting_anywhere=is_starting_anywhere,
             learn=None if learn is None else str(learn.absolute()),
         )
         loop = subprocess.Popen(

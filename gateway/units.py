@@ -30,6 +30,10 @@ class AxisUnits:
         """Nearest position in counts of a link angle."""
         return round((angle_rad - self.home_angle_rad) * self.counts_per_revolution / math.tau)
 
+    def angle(self, counts: int) -> float:
+        """Link angle in rad at a position in counts."""
+        return self.home_angle_rad + counts * math.tau / self.counts_per_revolution
+
     def counts_in(self, angle_rad: float) -> int:
         """A difference in rad as counts."""
         return round(angle_rad * self.counts_per_revolution / math.tau)

@@ -104,6 +104,14 @@ class MotionError(MechanismError):
         self.reason = reason
 
 
+class ApproachError(MechanismError):
+    """The linkage cannot be brought from where it stands onto its cam; ``reason`` says why."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(reason)
+        self.reason = reason
+
+
 class SynthesisError(MechanismError):
     """A synthesis cannot be done as asked; ``reason`` says why, ``term`` names the term that cannot be met."""
 

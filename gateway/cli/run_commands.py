@@ -41,6 +41,7 @@ RUN_EPILOG = """Examples:
 \b
   drive-gateway run paper                                  on the configured bus, e.g. against sim-drive
   drive-gateway run my-machine.yaml -i socketcan -c can0 --cycles 100 --record run.mcap
+  drive-gateway run paper --from-here                      after a stop, from where the linkage stands
   drive-gateway run paper --virtual-time --seed 1 --json   gateway and emulator in virtual time
   drive-gateway run paper --learn memory.json              learn from cycle to cycle, go on where the last run ended
 
@@ -101,6 +102,7 @@ def _run_on_bus(
     frames: bool | None,
     is_homing_again: bool = False,
     learn: Path | None = None,
+    is_starting_anywhere: bool = False,
 ) -> None:
     from gateway.session import Progress as RunProgress
     from gateway.session import StopSwitch, run_realtime
@@ -136,6 +138,7 @@ def _run_on_bus(
             is_overwriting=is_overwriting,
             with_frames=address.interface == "socketcan" if frames is None else frames,
             is_homing_again=is_homing_again,
+            is_starting_anywhere=is_starting_anywhere,
             learn=learn,
             on_progress=on_progress,
             on_event=on_event,
@@ -241,7 +244,9 @@ def _show(recording: Path, as_json: bool, report_folder: Path | None, is_machine
     if read.stopped_by != StopReason.COMPLETED.value:
         sentences = [f"the run did not complete, it was stopped by: {read.stopped_by}"]
         if is_machine_left and (where := _where_the_machine_stands(read)):
-            sentences.append(f"the linkage stands with {where}: bring it home before the next run")
+            sentences.append(
+                f"the linkage stands with {where}: bring it home before the next run, or give that one --from-here"
+            )
         complain(sentences, EXIT_NO)
 
 
@@ -260,6 +265,13 @@ def run(
     home_here: Annotated[
         bool,
         typer.Option("--home-here", help="Home the axes where they stand, even if their drives are homed already."),
+    ] = False,
+    from_here: Annotated[
+        bool,
+        typer.Option(
+            "--from-here",
+            help="Go slowly onto the cam from wherever the linkage stands, clear of its singular positions.",
+        ),
     ] = False,
     learn: Annotated[
         Path | None,
@@ -290,7 +302,7 @@ def run(
     else:
         count = settings.motion.machine_cycles if cycles is None else cycles
         address = resolve_bus(settings.bus, interface, channel, port)
-        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here, learn)
+        _run_on_bus(prepared, cam, address, recording, count, is_overwriting, frames, home_here, learn, from_here)
     _show(recording, as_json, None, is_machine_left=not virtual_time)
 
 
