@@ -12,6 +12,8 @@ from sim_drive.demand import Piece
 # ruckig has no type information; what comes out of it is typed in _pieces.
 _RUCKIG: Final = cast("Any", ruckig)
 _SHORT_S: Final = 1e-9
+_LENGTH: Final = 1000.0
+"""Counts in the unit of length that ruckig is given: its thresholds are absolute, and made for numbers about 1."""
 
 
 def to_velocity(
@@ -25,8 +27,8 @@ def to_velocity(
     limit = slowing_down if abs(target) < abs(velocity) and velocity * target >= 0.0 else speeding_up
     request = _request(velocity, acceleration, limit, limit, jerk)
     request.control_interface = _RUCKIG.ControlInterface.Velocity
-    request.target_velocity = [target]
-    request.max_velocity = [max(abs(velocity), abs(target), 1.0)]
+    request.target_velocity = [target / _LENGTH]
+    request.max_velocity = [max(abs(velocity), abs(target), 1.0) / _LENGTH]
     pieces = _solve(request)
     if pieces is not None and target != 0.0:
         pieces.append(Piece(0.0, inf))
@@ -51,20 +53,20 @@ def to_position(
     direction = copysign(1.0, distance)
     forwards, backwards = (speeding_up, slowing_down) if direction > 0.0 else (slowing_down, speeding_up)
     request = _request(velocity, acceleration, forwards, backwards, jerk)
-    request.target_position = [distance]
-    request.target_velocity = [final]
-    request.max_velocity = [cruise]
+    request.target_position = [distance / _LENGTH]
+    request.target_velocity = [final / _LENGTH]
+    request.max_velocity = [cruise / _LENGTH]
     return _solve(request)
 
 
 def _request(velocity: float, acceleration: float, forwards: float, backwards: float, jerk: float) -> Any:
     request = _RUCKIG.InputParameter(1)
     request.current_position = [0.0]
-    request.current_velocity = [velocity]
-    request.current_acceleration = [acceleration]
-    request.max_acceleration = [forwards]
-    request.min_acceleration = [-backwards]
-    request.max_jerk = [jerk]
+    request.current_velocity = [velocity / _LENGTH]
+    request.current_acceleration = [acceleration / _LENGTH]
+    request.max_acceleration = [forwards / _LENGTH]
+    request.min_acceleration = [-backwards / _LENGTH]
+    request.max_jerk = [jerk / _LENGTH]
     return request
 
 
@@ -72,7 +74,7 @@ def _solve(request: Any) -> list[Piece] | None:
     trajectory = _RUCKIG.Trajectory(1)
     try:
         result = _RUCKIG.Ruckig(1).calculate(request, trajectory)
-    except RuntimeError:
+    except _RUCKIG.RuckigError:
         return None
     if result not in (_RUCKIG.Result.Working, _RUCKIG.Result.Finished):
         return None
@@ -80,7 +82,7 @@ def _solve(request: Any) -> list[Piece] | None:
     pieces: list[Piece] = []
     for duration_s, jerk in _steps(trajectory.profiles[0][0]):
         for part_s in _between_turns(velocity, acceleration, jerk, duration_s):
-            pieces.append(Piece(acceleration, part_s, jerk))
+            pieces.append(Piece(acceleration * _LENGTH, part_s, jerk * _LENGTH))
             velocity += (acceleration + 0.5 * jerk * part_s) * part_s
             acceleration += jerk * part_s
     return pieces
