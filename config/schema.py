@@ -255,6 +255,8 @@ class BusSection(Model):
     sdo_frames_a_cycle: Annotated[int, Field(ge=1, le=100)] = 2
     """Reserve for SDO while the cycle runs, requests and responses together; no more is sent."""
     sync_source: SyncSource = SyncSource.AUTO
+    trace_lateness: bool = False
+    """Tell, in the run's events, why cycles were late: processor taken away, stolen by the host, page faults."""
     processor: Annotated[int, Field(ge=0, le=4095)] | None = None
     """Processor that the cyclic loop is bound to; null: an isolated one if there is one, else none."""
     gateway_node_id: Annotated[int, Field(ge=1, le=MAX_NODE_ID)] = 127

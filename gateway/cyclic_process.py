@@ -34,6 +34,7 @@ from gateway.cycle_host import CycleHost
 from gateway.errors import GatewayError
 from gateway.event_text import describe
 from gateway.guard import Condition, StopReason
+from gateway.late_watch import LateWatch
 from gateway.learning_store import LearningStore, open_store
 from gateway.preparation import build_core, plan
 from gateway.ring import RingWriter, RunState, StopRequest
@@ -117,10 +118,10 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
     port.send(SYNC_FRAME)
 
 
-def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None]) -> None:
+def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late: LateWatch | None = None) -> None:
     """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
     try:
-        CycleHost(core, bus.cyclic, poll, service=bus.service, sync=bus.sync).run()
+        CycleHost(core, bus.cyclic, poll, service=bus.service, sync=bus.sync, late=late).run()
     except BusError:
         raise
     except Exception:
@@ -194,6 +195,9 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         kind, text, data = describe(event)
         ring.append_event(event.at_ns, kind, text, source="gateway", **data)
 
+    def on_late(text: str, figures: dict[str, int]) -> None:
+        ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)
+
     def poll() -> None:
         nonlocal answered
         for event in core.take_events():
@@ -206,7 +210,10 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     try:
         bus = join_bus(address, config, ring)
         ring.set_state(RunState.RUNNING)
-        run_guarded(core, bus, poll)
+        late = LateWatch(config.bus.cycle_us * 1000, on_late) if config.bus.trace_lateness else None
+        run_guarded(core, bus, poll, late)
+        if late is not None:
+            late.flush()
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:

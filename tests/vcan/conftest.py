@@ -11,6 +11,8 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PATIENCE_S = 240.0
+LATENESS = ("missed_tpdo", "missed_deadline", "axis_silent", "sync_lost")
+"""Conditions of the guard that a slow computer brings about."""
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +23,7 @@ def unhurried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
     config["emulator"]["missing_sync_limit"] = 1000
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 1000}
-    config["guard"] |= {name: {"reaction": "warn"} for name in ("missed_tpdo", "missed_deadline")}
+    config["guard"] |= {name: {"reaction": "warn"} for name in LATENESS}
     path = tmp_path_factory.mktemp("machine") / "unhurried.yaml"
     path.write_text(yaml.safe_dump(config))
     return path
