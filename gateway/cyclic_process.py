@@ -128,6 +128,9 @@ def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late
         if core.loop.is_running:
             stop_drives(core, bus.cyclic)
         raise
+    finally:
+        if late is not None:
+            late.flush()
 
 
 def tell_setting(ring: RingWriter, setting: RealTimeSetting) -> None:
@@ -164,6 +167,17 @@ def keep_memory(store: LearningStore, core: GatewayCore, ring: RingWriter) -> Ga
     return None
 
 
+def late_watch(config: GatewayConfig, ring: RingWriter) -> LateWatch | None:
+    """Who tells, as events of the run, why cycles were late; None unless the configuration asks for it."""
+    if not config.bus.trace_lateness:
+        return None
+
+    def tell(text: str, figures: dict[str, int]) -> None:
+        ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)
+
+    return LateWatch(config.bus.cycle_us * 1000, tell)
+
+
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
     """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
     config = parse_config(job.config_text, Path(job.config_path))
@@ -195,9 +209,6 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         kind, text, data = describe(event)
         ring.append_event(event.at_ns, kind, text, source="gateway", **data)
 
-    def on_late(text: str, figures: dict[str, int]) -> None:
-        ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)
-
     def poll() -> None:
         nonlocal answered
         for event in core.take_events():
@@ -210,10 +221,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     try:
         bus = join_bus(address, config, ring)
         ring.set_state(RunState.RUNNING)
-        late = LateWatch(config.bus.cycle_us * 1000, on_late) if config.bus.trace_lateness else None
-        run_guarded(core, bus, poll, late)
-        if late is not None:
-            late.flush()
+        run_guarded(core, bus, poll, late_watch(config, ring))
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:
