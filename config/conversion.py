@@ -20,11 +20,12 @@ TORQUE_SHARE_PER_GAIN: Final = 10.0 / 2048.0 / 256.0
 class ControllerGains:
     """Gains of a drive's position controller in SI units.
 
-    ``proportional_Nm_per_rad`` for the error; ``derivative_Nms_per_rad`` for its rate, ``damping_Nms_per_rad`` for the
-    actual velocity, taken off, ``velocity_Nms_per_rad`` for the demand's.
+    ``proportional_Nm_per_rad`` for the error, ``integrating_Nm_per_rad_s`` for its integral, ``derivative_Nms_per_rad``
+    for its rate; ``damping_Nms_per_rad`` for the actual velocity, taken off, ``velocity_Nms_per_rad`` for the demand's.
     """
 
     proportional_Nm_per_rad: float
+    integrating_Nm_per_rad_s: float
     derivative_Nms_per_rad: float
     damping_Nms_per_rad: float
     velocity_Nms_per_rad: float
@@ -66,12 +67,13 @@ def dynamics_parameters(config: GatewayConfig) -> DynamicsParameters:
 
 
 def controller_gains(axis: AxisSection) -> ControllerGains:
-    """The emulated drive's gains K_P, K_D, K_V and K_F (eq. 5 and 6 of the paper) as torques."""
+    """The emulated drive's gains K_P, K_I, K_D, K_V and K_F (eq. 5 and 6 of the paper) as torques."""
     per_rad = axis.counts_per_revolution / math.tau * TORQUE_SHARE_PER_GAIN * axis.emulation.torque_per_volt_Nm
     per_rate = per_rad / CONTROLLER_RATE_HZ
     gains = axis.emulation.gains
     return ControllerGains(
         gains.K_P * per_rad,
+        gains.K_I * per_rad * CONTROLLER_RATE_HZ,
         gains.K_D * per_rate,
         gains.K_V * per_rate,
         gains.K_F * per_rate,

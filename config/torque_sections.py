@@ -57,6 +57,7 @@ class LearnedAxisSection(Model):
     """How the error of an axis becomes torque in learning; what is left out is what its ``emulation`` gains say."""
 
     proportional_Nm_per_rad: NotNegative | None = None
+    integrating_Nm_per_rad_s: NotNegative | None = None
     derivative_Nms_per_rad: NotNegative | None = None
     bound_Nm: Positive | None = None
     """Greatest correction; null: half of the rated torque."""
@@ -69,8 +70,8 @@ class LearningSection(Model):
     memory: Annotated[str, Field(min_length=1, max_length=1000)] | None = None
     """File to resume from and to write to, or a folder that has one for each profile; relative to the configuration."""
     gain: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
-    """Share of the remaining error that is taken into the correction in each revolution."""
-    window_ms: Annotated[float, Field(ge=1.0, le=1000.0)] = 8.0
+    """Share of the torque still missing that is taken into the correction in each revolution."""
+    window_ms: Annotated[float, Field(ge=1.0, le=1000.0)] = 6.0
     """Half width of the zero-phase low pass."""
     settle_ms: Annotated[float, Field(ge=0.0, le=60_000.0)] = 100.0
     """Constant speed before anything is learned."""

@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
-from gateway.learning import LearningObserver
 from gateway.sample import Phase
 from gateway.torque_offsets import TorqueOffsets
 from gateway.units import AxisUnits, wrap_counts
@@ -108,9 +107,9 @@ class CamDemand:
         self.master_position, self.master_velocity, self._acceleration = plan.at(0.0)
 
     @property
-    def observer(self) -> LearningObserver | None:
-        """Who is to be shown the following errors; None if nothing is learned from them."""
-        return None if self._torques is None else self._torques.observer
+    def observer(self) -> TorqueOffsets | None:
+        """Who is to be shown what the axes do; None if nothing is learned from it."""
+        return self._torques if self._torques is not None and self._torques.is_learning else None
 
     @property
     def is_finished(self) -> bool:

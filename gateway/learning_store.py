@@ -18,7 +18,7 @@ KEPT_AFTER: Final = frozenset({StopReason.COMPLETED, StopReason.OPERATOR})
 class LearningStore:
     """The memory of one cam, read before a run and written after it."""
 
-    __slots__ = ("_config", "_memory", "path")
+    __slots__ = ("_config", "_memory", "_profile", "path")
 
     def __init__(self, config: GatewayConfig, profile: CamProfile, path: Path) -> None:
         """``path``: the file, which need not be there yet, or a folder with one for each profile.
@@ -27,6 +27,7 @@ class LearningStore:
         """
         crc = cam_crc32(profile)
         self._config = config
+        self._profile = profile
         self.path: Final = memory_file(path, config.name, crc)
         if not self.path.parent.is_dir():
             raise UsageError(f"{self.path}: cannot be written (there is no folder {self.path.parent})")
@@ -34,7 +35,7 @@ class LearningStore:
 
     def learning(self) -> Learning:
         """Where the runs before have got to; learning begins anew at a speed that has not been run yet."""
-        return build_learning(self._config, self._memory.nearest(self._config.speed_rad_per_s))
+        return build_learning(self._config, self._profile, self._memory.nearest(self._config.speed_rad_per_s))
 
     def keep(self, core: GatewayCore) -> bool:
         """Write what the core has learned, if the run ended as it should; returns whether it was written.

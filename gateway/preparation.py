@@ -289,7 +289,7 @@ def build_core(
     loop.sync_gap_limit = config.guard.sync_lost.limit_cycles
     units = (channels[0].units, channels[1].units)
     if learning is None and config.learning.enabled:
-        learning = build_learning(config)
+        learning = build_learning(config, profile)
     demand = CamDemand(
         profile,
         units,

@@ -4,6 +4,7 @@ A demand asks once a cycle, with the master's position, velocity and acceleratio
 sends. The torque sent with that target acts at another instant; see ``torque_lead_s``.
 """
 
+from collections.abc import Sequence
 from math import degrees, tau
 from typing import Final
 
@@ -20,7 +21,7 @@ from config.conversion import (
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError
 from gateway.feed_forward import FeedForward
-from gateway.learning import Learning, LearningObserver
+from gateway.learning import LearnedTorque, Learning
 from gateway.units import INT16_MAX, AxisUnits
 from mechanism.cam_profile import CamProfile
 
@@ -39,7 +40,7 @@ def torque_lead_s(cycle_s: float, torque_delay_s: float) -> float:
 class TorqueOffsets:
     """The torque offsets of both axes in per mille of rated torque, model and learning together, bounded."""
 
-    __slots__ = ("_feed_forward", "_lead_s", "_learning", "_limits", "_units", "observer")
+    __slots__ = ("_feed_forward", "_lead_s", "_learning", "_limits", "_rad_per_count", "_units")
 
     def __init__(
         self,
@@ -51,18 +52,26 @@ class TorqueOffsets:
     ) -> None:
         """``limits_Nm`` bounds either axis' offset, both ways; ``lead_s``: see ``torque_lead_s``."""
         self._units = units
-        self._limits = tuple(min(unit.permille(limit), INT16_MAX) for unit, limit in zip(units, limits_Nm, strict=True))
+        self._limits = tuple(
+            min(limit, INT16_MAX * unit.rated_torque / 1000.0) for unit, limit in zip(units, limits_Nm, strict=True)
+        )
+        self._rad_per_count = tuple(tau / unit.counts_per_revolution for unit in units)
         self._lead_s = lead_s
         self._feed_forward = feed_forward
         self._learning = learning
-        self.observer = None if learning is None else LearningObserver(learning, units)
-        """Takes the following errors; None if nothing is learned."""
 
-    def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
-        """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""
-        lead = self._lead_s
-        position += lead * (velocity + 0.5 * lead * acceleration)
-        velocity += lead * acceleration
+    @property
+    def is_learning(self) -> bool:
+        """Whether anything is made of what ``observe`` is shown."""
+        return self._learning is not None
+
+    @property
+    def learned(self) -> LearnedTorque | None:
+        """What has been learned until now, a copy; None if nothing has."""
+        return None if self._learning is None else self._learning.learned
+
+    def torques(self, position: float, velocity: float, acceleration: float) -> tuple[float, float]:
+        """Torques of master and slave (N m) for this state of the master (rad, rad/s, rad/s^2)."""
         master = slave = 0.0
         if self._feed_forward is not None:
             master, slave = self._feed_forward.torques(position, velocity, acceleration)
@@ -70,13 +79,22 @@ class TorqueOffsets:
             learned = self._learning.torques(position, velocity)
             master += learned[0]
             slave += learned[1]
-        units, limits = self._units, self._limits
-        master_offset = units[0].permille(share * master)
-        slave_offset = units[1].permille(share * slave)
-        return [
-            max(-limits[0], min(limits[0], master_offset)),
-            max(-limits[1], min(limits[1], slave_offset)),
-        ]
+        limits = self._limits
+        return max(-limits[0], min(limits[0], master)), max(-limits[1], min(limits[1], slave))
+
+    def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
+        """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""
+        lead = self._lead_s
+        ahead = position + lead * (velocity + 0.5 * lead * acceleration)
+        master, slave = self.torques(ahead, velocity + lead * acceleration, acceleration)
+        units = self._units
+        return [units[0].permille(share * master), units[1].permille(share * slave)]
+
+    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
+        """Learn from the following errors of a cycle; see `gateway.cycle.ErrorObserver`."""
+        if self._learning is not None:
+            master, slave = self._rad_per_count
+            self._learning.observe(master_position, master_velocity, is_steady, master * errors[0], slave * errors[1])
 
 
 def build_torque_offsets(

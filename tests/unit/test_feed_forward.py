@@ -86,9 +86,13 @@ def test_where_the_linkage_does_not_close_no_torque_is_asked_for():
 
 
 def test_the_torque_leads_by_what_the_drive_needs_less_half_a_cycle():
-    # 1.5 servo periods and 1 ms of amplifier: 2.465 ms; a torque held from one cycle before its target on: -0.5 ms.
-    assert torque_delay_s(PAPER) == pytest.approx(1.5 / 1024 + 0.001)
-    assert torque_lead_s(PAPER.cycle_s, torque_delay_s(PAPER)) == pytest.approx(0.001965, abs=1e-6)
+    drives = [axis.emulation for axis in PAPER.ordered_axes]
+    assert [drive.torque_time_constant_s for drive in drives] == [0.001, 0.001]
+    # Half a servo period, those that the output waits, and 1 ms of amplifier.
+    delay = (0.5 + drives[0].output_delay_periods) / 1024 + 0.001
+    assert torque_delay_s(PAPER) == pytest.approx(delay)
+    # A torque that is held from one cycle before its target on acts half a cycle before it.
+    assert torque_lead_s(PAPER.cycle_s, torque_delay_s(PAPER)) == pytest.approx(delay - 0.0005)
     assert torque_delay_s(with_feed_forward("{torque_delay_us: 700}")) == pytest.approx(0.0007)
 
 
