@@ -11,7 +11,6 @@ from typing import Any, Final, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from mechanism.synthesis.run import Run
 from mechanism.synthesis.task import VARIABLE_COUNT, SynthesisTask, Timing, Variable
@@ -52,6 +51,9 @@ def _jacobian(task: SynthesisTask, crank: Float) -> Float:
 
 def refine_crank(task: SynthesisTask, crank: Float) -> tuple[Float, float, int]:
     """The nearest crank dyad within the bounds with the least sum of squared errors, that sum (m^2), evaluations."""
+    # Imported where it is needed, as scipy takes its time.
+    from scipy.optimize import least_squares  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
+
     columns = list(CRANK_VARIABLES)
     lower, upper = task.bounds.lower[columns], task.bounds.upper[columns]
     free = upper > lower

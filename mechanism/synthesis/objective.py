@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanism.errors import ParameterError
 from mechanism.jit import COMPILED
-from mechanism.spline import periodic_quintic
 from mechanism.synthesis.all_kernels import ALL_TERMS, evaluate_all_terms
 from mechanism.synthesis.further_kernels import ZONE_COLUMNS
 from mechanism.synthesis.machine_model import MachineModel
@@ -65,6 +64,9 @@ def _fourier(theta2: Float, harmonics: int) -> Float:
 
 def _derivatives(theta2: Float) -> tuple[Float, Float]:
     """The matrices that take values at theta2 to the first and second derivative there of their periodic spline."""
+    # scipy takes longer to import than the paper's whole search: only where it is needed.
+    from mechanism.spline import periodic_quintic
+
     closed = np.append(theta2, theta2[0] + tau)
     identity = np.eye(theta2.size)
     spline = periodic_quintic(closed, np.vstack((identity, identity[:1])))

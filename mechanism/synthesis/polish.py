@@ -5,7 +5,6 @@ from typing import Any, Final, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
 from mechanism.synthesis.crank_dyads import CRANK_VARIABLES, refine_crank
 from mechanism.synthesis.run import Run
@@ -77,6 +76,9 @@ class _SpentError(Exception):
 
 def _minimise(run: Run, step: float) -> None:
     """Quasi-Newton (L-BFGS-B) from the best, with differences of ``step``."""
+
+    # Imported where it is needed, as scipy takes its time.
+    from scipy.optimize import minimize  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
     def value_and_gradient(unit: Float) -> tuple[float, Float]:
         if run.ledger.left < 2 * VARIABLE_COUNT + 1:
