@@ -1,7 +1,7 @@
 """Differential evolution with a success history and a population that shrinks (L-SHADE; Tanabe and Fukunaga, 2014).
 
-Written here, because the whole population goes through the kernel at once and a search must be able to stop and go on:
-what scipy's does in Python between two evaluations costs many times what the evaluations do.
+Written here, because a search must be able to step, to be saved and to go on, none of which scipy's offers; it costs
+about as much between two evaluations as that one does.
 """
 
 from typing import Any, Final

@@ -1,5 +1,6 @@
 """Several terms at once (the package pymoo, NSGA-II): not one best mechanism, but the front among which to choose."""
 
+from collections.abc import Callable
 from typing import Any, Final, cast
 
 import numpy as np
@@ -26,6 +27,10 @@ PARETO_TERMS: Final = (
 
 CONSTRAINTS: Final = frozenset({Term.MOBILITY, Term.SINGULARITY, Term.TIMING, Term.KEEP_OUT})
 """Terms that a mechanism on the front must have at 0: what breaks them is no mechanism to choose."""
+
+
+GREATEST_MEAN_ERROR: Final = 0.02
+"""What misses the curve by more than so much of its size, averaged over the points, is not worth choosing either."""
 
 
 def objective_columns(task: SynthesisTask) -> tuple[list[int], list[int]]:
@@ -64,23 +69,36 @@ def _algorithm(run: Run, first: Float, objectives: int, constraints: int, size: 
     return algorithm
 
 
-def _front(algorithm: Any, run: Run) -> tuple[Float, Float]:
-    """Variables (k, 8) and objectives and constraints (k, f + c) of the front, sorted by the first objective."""
+def _front(algorithm: Any, run: Run) -> Float:
+    """The mechanisms (k, 8) of the front, sorted by the first objective."""
     best = algorithm.opt
     unit, rows = np.asarray(best.get("X"), dtype=np.float64), np.asarray(best.get("F"), dtype=np.float64)
-    violations = np.asarray(best.get("G"), dtype=np.float64).reshape(unit.shape[0], -1)
-    order = np.lexsort(rows.T[::-1])
-    return run.spread(unit[order]), np.concatenate((rows, violations), axis=1)[order]
+    return run.spread(unit[np.lexsort(rows.T[::-1])])
+
+
+def _answer(task: SynthesisTask) -> tuple[Callable[[Float, Float], Float], int, int]:
+    """What the algorithm is told of the terms, how many of its columns are objectives, and how many constraints."""
+    objectives, constraints = objective_columns(task)
+    error = task.column(Term.STRUCTURAL_ERROR)
+    per_size = 1e-3 / (task.count * task.size_m)
+
+    def answer(terms: Float, values: Float) -> Float:
+        table = np.nan_to_num(terms, nan=1e300, posinf=1e300)
+        columns = [table[:, objectives], table[:, constraints]]
+        if error is not None:
+            # As a length: squared, the spread over the front would all be at its far end.
+            mean_error = np.sqrt(table[:, error]) * per_size
+            if error in objectives:
+                columns[0][:, objectives.index(error)] = mean_error
+            columns.append(mean_error[:, np.newaxis] - GREATEST_MEAN_ERROR)
+        return np.concatenate(columns, axis=1)
+
+    return answer, len(objectives), len(constraints) + (error is not None)
 
 
 def pareto_steps(run: Run) -> Steps:
     """NSGA-II, until the search's share of the budget is used; every step has the front so far."""
-    objectives, constraints = objective_columns(run.task)
-    columns = objectives + constraints
-
-    def answer(terms: Float, values: Float) -> Float:
-        return np.nan_to_num(terms[:, columns], nan=1e300, posinf=1e300)
-
+    answer, objectives, constraints = _answer(run.task)
     random = np.random.default_rng(run.seed)
     size = run.population or POPULATION
     before = run.ledger.evaluations
@@ -89,15 +107,15 @@ def pareto_steps(run: Run) -> Steps:
     if run.saved is not None:
         run.ledger.evaluations = before
     journal = Journal(run, answer)
-    algorithm = _algorithm(run, first, len(objectives), len(constraints), size)
+    algorithm = _algorithm(run, first, objectives, constraints, size)
     while used + size <= run.search_budget:
         replayed = journal.replaying
         offspring = algorithm.ask()
         unit = np.asarray(offspring.get("X"), dtype=np.float64)
         rows = journal.ask(run.spread(unit))
-        offspring.set("F", rows[:, : len(objectives)])
+        offspring.set("F", rows[:, :objectives])
         if constraints:
-            offspring.set("G", rows[:, len(objectives) :])
+            offspring.set("G", rows[:, objectives:])
         algorithm.tell(infills=offspring)
         used += unit.shape[0]
         if not replayed and journal.generation % run.report_every == 0:

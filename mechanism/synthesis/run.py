@@ -58,11 +58,11 @@ class Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """After a generation: its number, what to save to go on from here, and the front (variables, terms) if any."""
+    """After a generation: its number, what to save to go on from here, and the front (k, 8) if any."""
 
     generation: int
     save: Callable[[], Saved]
-    front: tuple[Float, Float] | None = None
+    front: Float | None = None
 
 
 Steps = Iterator[Step]

@@ -82,13 +82,12 @@ class Progress:
         return self.pack_state()
 
 
-def _candidates(task: SynthesisTask, front: tuple[Float, Float] | None) -> tuple[Candidate, ...]:
+def _candidates(task: SynthesisTask, front: Float | None) -> tuple[Candidate, ...]:
     if front is None:
         return ()
-    terms = evaluate(task, front[0])
+    terms = evaluate(task, front)
     return tuple(
-        Candidate(task, variables, row, float(row @ task.weights))
-        for variables, row in zip(front[0], terms, strict=True)
+        Candidate(task, variables, row, float(row @ task.weights)) for variables, row in zip(front, terms, strict=True)
     )
 
 
