@@ -38,5 +38,8 @@ class Quirk(Enum):
     """Cyclic modes are refused while 1006h is 0 (isel IMD20)."""
     NO_CYCLIC_POSITION_MODE = "no_cyclic_position_mode"
     """Mode 8 is refused, and not among the modes of 6502h (drives that only interpolate)."""
+    LATE_SYNC_FREEZES = "late_sync_freezes"
+    """In cyclic modes, with 1006h set, a SYNC that is more than 0.5 ms late freezes the axis where its demand is, and
+    sets statusword bit 15, until the next SYNC (isel IMD20)."""
     TORQUE_OFFSET_NOT_MAPPABLE = "torque_offset_not_mappable"
     """60B2h is there, but no PDO takes it (06040041h)."""

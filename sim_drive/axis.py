@@ -40,7 +40,7 @@ from sim_drive.modes.profile_position import ProfilePosition
 from sim_drive.modes.profile_torque import ProfileTorque
 from sim_drive.modes.profile_velocity import ProfileVelocity
 from sim_drive.motion import Latch, SetPointSource, wrap_int32
-from sim_drive.quirks import MODE_SWITCH_NS
+from sim_drive.quirks import MODE_SWITCH_NS, SYNC_PATIENCE_NS
 from sim_drive.settings import DriveSettings
 from sim_drive.switches import DigitalInput
 from sim_drive.touch_probe import TouchProbe
@@ -52,10 +52,12 @@ CONTROLLER_GAIN_COUNT: Final = 5
 
 _HALF: Final = 1 << 31
 _NS_PER_MS: Final = 1_000_000
+_NS_PER_US: Final = 1_000
 
 _BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
 _FOLLOWING_ERROR: Final = int(Statusword.FOLLOWING_ERROR)
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
+_FROZEN: Final = int(Statusword.FROZEN)
 _FAULT_RESET: Final = int(Controlword.FAULT_RESET)
 _HALT: Final = int(Controlword.HALT)
 _OPTION_CODES: Final = {
@@ -89,14 +91,16 @@ class Axis(MeasuredMotion):
         "_active",
         "_after_ramp",
         "_coming_mode",
+        "_cycle_period",
         "_enabled_bits",
         "_errors",
         "_events",
         "_following_error_since_ns",
         "_following_error_timeout",
         "_following_error_window",
+        "_freezes",
         "_gain_entries",
-        "_has_limit_switches",
+        "_has_stops",
         "_homing",
         "_idle_controlword",
         "_interpolation_exponent",
@@ -108,11 +112,13 @@ class Axis(MeasuredMotion):
         "_rated_torque_Nm",
         "_state",
         "_statusword",
+        "_synced_at_ns",
         "_ticking",
         "_torque_limits",
         "_torque_offset",
         "_touch_probe",
         "gains",
+        "is_frozen",
         "is_switched_off",
         "negative_torque_limit_Nm",
         "node_id",
@@ -158,7 +164,6 @@ class Axis(MeasuredMotion):
         self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
         self._rated_torque_Nm = settings.rated_torque_Nm
         self._touch_probe = TouchProbe(self)
-        self._has_limit_switches = bool(settings.switches.fitted & ~DigitalInput.HOME)
         self._set_defaults()
         self._set_hooks()
 
@@ -194,6 +199,13 @@ class Axis(MeasuredMotion):
         self._following_error_since_ns: int | None = None
         self._coming_mode: tuple[int, int] | None = None
         """With a slow mode switch: the mode, and when it is entered."""
+        has_limit_switches = bool(settings.switches.fitted & ~DigitalInput.HOME)
+        self._has_stops = has_limit_switches or Quirk.LATE_SYNC_FREEZES in settings.quirks
+        self._freezes = Quirk.LATE_SYNC_FREEZES in settings.quirks
+        self._cycle_period = dictionary.entry(objects.COMMUNICATION_CYCLE_PERIOD)
+        self._synced_at_ns: int | None = None
+        self.is_frozen = False
+        """With the habit of freezing: whether a SYNC is late."""
         is_odd = Quirk.SET_POINT_ACKNOWLEDGE_STAYS in settings.quirks
         self._enabled_bits = int(Statusword.SET_POINT_ACKNOWLEDGE) if is_odd else 0
         """Set in the statusword whenever operation is enabled."""
@@ -343,8 +355,9 @@ class Axis(MeasuredMotion):
         demand = self.demand.at(now_ns)
         self.position_demand_counts = demand
         if self._active is not None:
-            if self._has_limit_switches:
-                self.look_at_switches(now_ns, self._mode is Mode.HOMING)
+            if self._has_stops:
+                self._look_for_stops(now_ns)
+                demand = self.demand.at(now_ns)
             if self.is_guarded and now_ns - self.set_point_at_ns > self.set_point_timeout_ns:
                 self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
                 return
@@ -568,6 +581,8 @@ class Axis(MeasuredMotion):
         self.is_halted = False
         self.barred = 0
         self.is_at_switch = False
+        self.is_frozen = False
+        self._synced_at_ns = None
         if active is not None:
             active.leave(now_ns)
 
@@ -580,10 +595,38 @@ class Axis(MeasuredMotion):
         self._active = mode
         self._ticking = mode if mode.is_ticking else None
         self.on_sync = mode.on_sync
+        if self._freezes and self._mode in _TIMED_MODES:
+            self.on_sync = self._watch_sync(mode)
         self.is_halted = bool(self.controlword.value & _HALT)
         mode.enter(now_ns)
         if self.is_halted and self._active is mode:
             mode.halt(now_ns)
+
+    # -- the habit of freezing when a SYNC is late ------------------------------------------------------------------
+
+    def _watch_sync(self, mode: OperationMode) -> Callable[[int], None]:
+        def on_sync(now_ns: int) -> None:
+            self._synced_at_ns = now_ns
+            if self.is_frozen:
+                self.is_frozen = False
+                self.show_status()
+            mode.on_sync(now_ns)
+
+        return on_sync
+
+    def _look_for_stops(self, now_ns: int) -> None:
+        if self._freezes:
+            self._freeze_if_late(now_ns)
+        self.look_at_switches(now_ns, self._mode is Mode.HOMING)
+
+    def _freeze_if_late(self, now_ns: int) -> None:
+        cycle_ns: int = self._cycle_period.value * _NS_PER_US
+        if self._synced_at_ns is None or not cycle_ns or self.is_frozen:
+            return
+        if now_ns - self._synced_at_ns > cycle_ns + SYNC_PATIENCE_NS:
+            self.is_frozen = True
+            self.demand.hold(self.demand.at(now_ns))
+            self.show_status()
 
     # -- interpolation time 60C2h --------------------------------------------------------------------------------
 
@@ -610,6 +653,8 @@ class Axis(MeasuredMotion):
             word |= self._enabled_bits
         if self.is_at_switch:
             word |= _LIMITED
+        if self.is_frozen:
+            word |= _FROZEN
         self._statusword.value = word
         self._mode_display.value = int(self._mode)
 

@@ -70,6 +70,8 @@ class Statusword(IntFlag):
     SPEED_ZERO = 1 << 12
     INTERPOLATION_ACTIVE = 1 << 12
     FOLLOWING_ERROR = 1 << 13
+    FROZEN = 1 << 15
+    """A manufacturer's bit, with the habit of freezing when a SYNC is late."""
     HOMING_ERROR = 1 << 13
 
 

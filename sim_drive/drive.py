@@ -160,7 +160,9 @@ class Drive:
             acts_on_receipt=Quirk.RPDO_ACTS_ON_RECEIPT in settings.quirks,
         )
         self._communication_error = self.dictionary.entry(objects.ERROR_BEHAVIOUR, 1)
-        self._memory = ParameterMemory(self.dictionary, store or MemoryParameterStore(), self._on_parameters_saved)
+        self._memory = ParameterMemory(
+            node_id, self.dictionary, store or MemoryParameterStore(), self._on_parameters_saved
+        )
         hooks = LssHooks(self._memory.save_layer_settings, self._on_lss_waiting, self._on_bit_timing)
         self._lss = LssSlave(node_id, self.dictionary, self.outbox, hooks, can_change=describe is not None)
         if self._memory.stored.values:
@@ -432,6 +434,7 @@ class Drive:
             return
         self.events.append(NodeIdChanged(now_ns, self.node_id, node_id))
         self.node_id = node_id
+        self._memory.node_id = node_id
         if self._describe is not None and node_id != UNCONFIGURED_NODE_ID:
             self.dictionary.redescribe(self._describe(node_id))
             self.dictionary.restore_defaults(objects.DEVICE_TYPE, _LAST_COMMUNICATION_INDEX)

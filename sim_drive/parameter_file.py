@@ -28,6 +28,8 @@ class _Body(BaseModel):
     version: Literal[1] = 1
     node_id: Annotated[int, Field(ge=1, le=127)] | Literal[255] | None = None
     bit_timing: Annotated[int, Field(ge=0, le=9)] | None = None
+    saved_as: Annotated[int, Field(ge=1, le=127)] | None = None
+    """Node id under which the values were saved; files of the time before it was noted lack it."""
     values: dict[
         Annotated[str, Field(pattern=r"^[0-9A-F]{4}:[0-9A-F]{2}$")],
         Annotated[str, Field(pattern=r"^([0-9A-F]{2}){1,8}$")],
@@ -36,7 +38,8 @@ class _Body(BaseModel):
 
     def crc32(self) -> int:
         """CRC-32 of everything but itself, in the one way to write it."""
-        text = json.dumps(self.model_dump(), sort_keys=True, separators=(",", ":"))
+        without = {"saved_as"} if self.saved_as is None else None
+        text = json.dumps(self.model_dump(exclude=without), sort_keys=True, separators=(",", ":"))
         return zlib.crc32(text.encode())
 
 
@@ -76,13 +79,14 @@ class FileParameterStore:
         if body.crc32() != file.crc32:
             raise ParameterStoreError(f"{self.path}: damaged: its CRC-32 is {body.crc32()}, not {file.crc32}")
         values = {_place(name): bytes.fromhex(data) for name, data in body.values.items()}
-        return StoredParameters(values, body.node_id, body.bit_timing)
+        return StoredParameters(values, body.node_id, body.bit_timing, body.saved_as)
 
     def save(self, parameters: StoredParameters) -> None:
         """See ParameterStore."""
         body = _Body(
             node_id=parameters.node_id,
             bit_timing=parameters.bit_timing,
+            saved_as=parameters.saved_as,
             values={
                 f"{index:04X}:{subindex:02X}": data.hex().upper()
                 for (index, subindex), data in sorted(parameters.values.items())

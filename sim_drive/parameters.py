@@ -10,6 +10,7 @@ from drivers import objects
 from drivers.node import Event
 from drivers.object_dictionary import decode, encode
 from drivers.sdo import AbortCode
+from sim_drive.cob_ids import COB_ID_MASK
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.logical_axes import in_first_axis
 
@@ -60,6 +61,12 @@ VOLATILE_OBJECTS: Final = frozenset(
 """Writable objects that are commands, demands or contents of their own, and so no parameters."""
 
 
+_PDO_PARAMETERS: Final = frozenset(
+    first + number for first in (objects.RPDO_COMMUNICATION, objects.TPDO_COMMUNICATION) for number in range(512)
+)
+"""Communication parameters of every PDO there may be."""
+
+
 @dataclass(frozen=True, slots=True)
 class StoredParameters:
     """What a drive keeps while it has no supply."""
@@ -70,6 +77,8 @@ class StoredParameters:
     """Stored by LSS, 1 to 127, or 255 for none at all; None: the one that the drive is made with."""
     bit_timing: int | None = None
     """Index into the bit timing table of CiA 305, stored by LSS."""
+    saved_as: int | None = None
+    """Node id that the drive had when ``values`` were saved; None: not known."""
 
 
 class ParameterStoreError(Exception):
@@ -120,10 +129,14 @@ class ParameterMemory:
     no difference before the next of these, as CiA 301 has it.
     """
 
-    __slots__ = ("_dictionary", "_on_saved", "_store", "damage", "stored")
+    __slots__ = ("_dictionary", "_on_saved", "_store", "damage", "node_id", "stored")
 
-    def __init__(self, dictionary: LiveDictionary, store: ParameterStore, on_saved: Callable[[int], None]) -> None:
+    def __init__(
+        self, node_id: int, dictionary: LiveDictionary, store: ParameterStore, on_saved: Callable[[int], None]
+    ) -> None:
         """Load what ``store`` has; ``on_saved(now_ns)``: something has been saved or restored."""
+        self.node_id = node_id
+        """Of the drive; it sets another one."""
         self._dictionary = dictionary
         self._store = store
         self._on_saved = on_saved
@@ -147,11 +160,19 @@ class ParameterMemory:
                 entry.on_read = _read_capability
 
     def apply(self, first_index: int, last_index: int) -> None:
-        """Put the stored values of this range of indices into the dictionary, without asking the hooks."""
+        """Put the stored values of this range of indices into the dictionary, without asking the hooks.
+
+        A COB-ID that was the default of the node id under which it was saved becomes that of the present one.
+        """
         for place, data in self.stored.values.items():
             if first_index <= place[0] <= last_index:
                 entry = self._dictionary.entry(*place)
                 entry.value = decode(entry.data_type, data)
+                saved_as = self.stored.saved_as
+                if saved_as is not None and _is_cob_id(*place) and isinstance(entry.default, int):
+                    was_default = entry.default - self.node_id + saved_as
+                    if not (entry.value ^ was_default) & COB_ID_MASK:
+                        entry.value = entry.value & ~COB_ID_MASK | entry.default & COB_ID_MASK
 
     def save_layer_settings(self, node_id: int, bit_timing: int | None, now_ns: int) -> bool:
         """Store what LSS has configured; whether it has worked."""
@@ -196,7 +217,7 @@ class ParameterMemory:
             for entry in self._entries(subindex):
                 variable = entry.variable
                 values[variable.index, variable.subindex] = encode(entry.data_type, entry.value)
-            is_done = self._save(replace(self.stored, values=values), now_ns)
+            is_done = self._save(replace(self.stored, values=values, saved_as=self.node_id), now_ns)
             return None if is_done else AbortCode.HARDWARE_ERROR
 
         return save
@@ -209,7 +230,8 @@ class ParameterMemory:
             values = {
                 place: data for place, data in self.stored.values.items() if not any(place[0] in area for area in areas)
             }
-            is_done = self._save(replace(self.stored, values=values), now_ns)
+            saved_as = self.stored.saved_as if values else None
+            is_done = self._save(replace(self.stored, values=values, saved_as=saved_as), now_ns)
             return None if is_done else AbortCode.HARDWARE_ERROR
 
         return restore
@@ -225,6 +247,11 @@ def is_storable(entry: Entry) -> bool:
         and variable.index >= objects.DEVICE_TYPE
         and in_first_axis(variable.index) not in VOLATILE_OBJECTS
     )
+
+
+def _is_cob_id(index: int, subindex: int) -> bool:
+    """Whether it is a COB-ID whose default depends on the node id: that of EMCY or of a PDO."""
+    return (index == objects.COB_ID_EMCY and subindex == 0) or (subindex == 1 and index in _PDO_PARAMETERS)
 
 
 def _name(place: Place) -> str:

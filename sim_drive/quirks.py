@@ -18,10 +18,12 @@ from sim_drive.logical_axes import in_first_axis
 if TYPE_CHECKING:
     from sim_drive.drive import Drive
 
-__all__ = ["MODE_SWITCH_NS", "Quirk", "apply_quirks", "describe_quirks"]
+__all__ = ["MODE_SWITCH_NS", "SYNC_PATIENCE_NS", "Quirk", "apply_quirks", "describe_quirks"]
 
 MODE_SWITCH_NS: Final = 100_000_000
 """What a mode switch takes with ``Quirk.SLOW_MODE_SWITCH``."""
+SYNC_PATIENCE_NS: Final = 500_000
+"""How late a SYNC may be with ``Quirk.LATE_SYNC_FREEZES``."""
 
 _MILLISECONDS: Final = -3
 _CYCLIC_MODES: Final = frozenset(

@@ -392,3 +392,29 @@ def test_fast_scan_passes_by_who_has_a_node_id(bench: LssBench, new: LssBench):
     new.lss("1107")
     assert new.put(0x7E5, "0400000000000000") == ["707#00"]
     assert not scan(new, 0, 128, 0, 0)
+
+
+def test_stored_cob_ids_of_the_old_node_id_become_those_of_the_new_one(bench: LssBench):
+    def sdo(node_id: int, request: str) -> str:
+        (answer,) = bench.put(0x600 + node_id, request)
+        return answer.removeprefix(f"{0x580 + node_id:03X}#")
+
+    # TPDO 1 is switched off, its COB-ID 185h kept; RPDO 1 gets one of its own; all is saved as node 5.
+    assert sdo(5, "23001801850100C0")[:2] == "60"
+    assert sdo(5, "2300140133020080")[:2] == "60"
+    assert sdo(5, "2310100173617665")[:2] == "60"
+    bench.put(0x7E5, "0401000000000000")
+    bench.put(0x7E5, "1109000000000000")
+    bench.put(0x7E5, "0400000000000000")
+    bench.put(0x000, "8205")
+    bench.tick()
+    assert sdo(9, "4000180100000000") == "43001801890100C0"
+    assert sdo(9, "4001180100000000") == "4301180189020" + "0C0"
+    assert sdo(9, "4014100000000000") == "4314100089000000"
+    assert sdo(9, "4000140100000000") == "4300140133020080"
+    # Saved as node 9, and node 5 again after a reset of the node: not what was saved, but what it means.
+    assert sdo(9, "2310100173617665")[:2] == "60"
+    bench.put(0x000, "8109")
+    bench.tick()
+    assert sdo(5, "4000180100000000") == "43001801850100C0"
+    assert sdo(5, "4000140100000000") == "4300140133020080"

@@ -339,3 +339,22 @@ def test_a_fault_of_a_node_that_is_not_there_is_refused() -> None:
 def test_every_kind_is_described() -> None:
     assert set(FAULTS) == set(FaultKind)
     assert {direction.value for direction in Direction} == {"sent", "received", "both"}
+
+
+def test_a_fault_follows_its_drive_to_another_node_id():
+    fault = Fault(FaultKind.MUTE_HEARTBEAT, 5, at_s=0.5, for_s=0.5)
+    line = Line([fault])
+    line.until(0.1)
+    assert line.write(0x1017, 0, 100, 2) == 0
+    for request in ("0401000000000000", "1109000000000000", "0400000000000000"):
+        line.put(0x7E5, request)
+    line.put(0x000, "8205")
+    line.put(0x609, "2B17100064000000")
+    assert "709#7F" in line.until(0.45)
+    assert not any(text.startswith("709#") for text in line.until(0.95)[1:])
+    assert "709#7F" in line.until(1.3)
+    # What is injected from now on is for the node that there is.
+    with pytest.raises(ValueError, match=r"no node 5 \(there are: 9\)"):
+        line.injector.inject(fault, line.now_ns)
+    line.injector.inject(Fault(FaultKind.OVER_CURRENT, 9), line.now_ns)
+    assert "089#1023030000000000" in line.run(0.01)

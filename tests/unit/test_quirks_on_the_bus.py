@@ -184,3 +184,39 @@ def test_the_torque_offset_cannot_be_mapped() -> None:
 
 def test_every_quirk_is_listed() -> None:
     assert describe_quirks().splitlines() == [quirk.value for quirk in Quirk]
+
+
+@pytest.mark.parametrize("quirks", [(), (Quirk.LATE_SYNC_FREEZES,)])
+def test_a_late_sync_freezes_the_axis(quirks: tuple[Quirk, ...]) -> None:
+    line = line_with(*quirks)
+    map_target_position(line)
+    assert line.write(0x1006, 0, 10_000, 4) == 0
+    assert line.write(0x60C2, 1, 10, 1) == 0
+    line.enable()
+    target = 0
+    for _ in range(10):
+        target += 100
+        line.put(0x205, struct.pack("<Hi", 0x0F, target).hex(), 0.001)
+        line.put(0x080, span_s=0.009)
+    assert not line.read(0x6041) & 0x8000
+    # The last target was to be reached 10 ms after its SYNC; then the next one is late, and a drive without the habit
+    # goes on for one interpolation time more.
+    line.run(0.009)
+    is_frozen = bool(quirks)
+    assert bool(line.read(0x6041) & 0x8000) is is_frozen
+    assert line.drive().position_demand_counts == pytest.approx(target + (0 if is_frozen else 75), abs=35)
+    assert line.read(0x6041) & 0x6F == 0x27
+    line.put(0x205, struct.pack("<Hi", 0x0F, target).hex(), 0.001)
+    line.put(0x080, span_s=0.005)
+    assert not line.read(0x6041) & 0x8000
+    assert line.write(0x6040, 0, 0x07, 2) == 0
+
+
+def test_without_a_cycle_period_no_sync_is_late() -> None:
+    line = line_with(Quirk.LATE_SYNC_FREEZES)
+    map_target_position(line)
+    line.enable()
+    line.put(0x205, struct.pack("<Hi", 0x0F, 0).hex())
+    line.put(0x080)
+    line.run(0.003)
+    assert not line.read(0x6041) & 0x8000
