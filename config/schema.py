@@ -98,13 +98,26 @@ class LimitsSection(Model):
     acceleration_rad_per_s2: Positive
     jerk_rad_per_s3: Positive | None = None
     following_error_counts: Annotated[int, Field(ge=1, le=0x7FFFFFFF)]
+    """The drive's window (6065h), beyond which it faults, and what the gateway guards."""
+    guarded_error_counts: Annotated[int, Field(ge=1, le=0x7FFFFFFF)] | None = None
+    """What the gateway guards if that is to be less, so that it reacts before the drive does."""
     quick_stop_deceleration_rad_per_s2: Positive | None = None
     """Of the drive's own ramp (6085h) in a quick stop and after a fault; null leaves what the drive has."""
+
+    @property
+    def gateway_error_counts(self) -> int:
+        """Following error that the gateway guards."""
+        return self.following_error_counts if self.guarded_error_counts is None else self.guarded_error_counts
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.position_deg is not None and self.position_deg[0] >= self.position_deg[1]:
             raise ValueError(f"position_deg: {self.position_deg[0]:g} is not below {self.position_deg[1]:g}")
+        if self.gateway_error_counts > self.following_error_counts:
+            raise ValueError(
+                f"guarded_error_counts: {self.guarded_error_counts} can never be met, the drive faults at"
+                f" following_error_counts {self.following_error_counts}"
+            )
         return self
 
 

@@ -265,7 +265,7 @@ def build_core(
     ``tpdo_deadline_us``: how long after SYNC the TPDOs are waited for; None is what the bus budget leaves.
     """
     channels = [
-        AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.following_error_counts)
+        AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.gateway_error_counts)
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
     ]
     setups = [

@@ -11,6 +11,7 @@ from gateway.cli.doctor_command import DOCTOR_EPILOG, doctor
 from gateway.cli.run_commands import DEMO_EPILOG, RUN_EPILOG, demo, run
 from gateway.cli.synthesis_commands import SYNTHESIZE_EPILOG, synthesize
 from gateway.cli.terminal import errors_answered
+from gateway.cli.tune_commands import TUNE_EPILOG, tune
 from gateway.cli.watch_commands import MONITOR_EPILOG, REPORT_EPILOG, monitor_command, report
 
 HELP: Final = """Run a hybrid five-bar machine over CANopen: compile a cam from a desired curve, download or stream it
@@ -28,6 +29,7 @@ app.command("download", epilog=DOWNLOAD_EPILOG)(download)
 app.command("synthesize", epilog=SYNTHESIZE_EPILOG)(synthesize)
 app.command("animate", epilog=ANIMATE_EPILOG)(animate)
 app.command("doctor", epilog=DOCTOR_EPILOG)(doctor)
+app.command("tune", epilog=TUNE_EPILOG)(tune)
 app.command("monitor", epilog=MONITOR_EPILOG)(monitor_command)
 
 

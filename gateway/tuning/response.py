@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
+from config.schema import GatewayConfig
 from gateway.errors import GatewayError
 from gateway.tuning.controller import SERVO_RATE_HZ
 from gateway.tuning.margins import Margins, margins_of
@@ -31,6 +33,8 @@ DEFAULT_FREQUENCIES_HZ: Final = (
     *range(140, 300, 20),
     *range(300, 461, 40),
 )
+FINE_COUNTS: Final = 1 << 20
+"""Counts a revolution of a resolver whose quantisation does not hide the loop."""
 _COMMAND: Final = 2
 _OFFSET: Final = 4
 
@@ -102,6 +106,18 @@ class MeasuredLoop:
     def margins(self) -> Margins:
         """As of a model; the least between the frequencies that were measured."""
         return margins_of(self.transfer[None], self.frequencies_hz, np.array([self.theta2]))
+
+
+def frictionless_text(config: GatewayConfig) -> str:
+    """The configuration for a measurement: without dry friction, and with resolvers of ``FINE_COUNTS``."""
+    document = config.model_dump(mode="json")
+    for axis in document["axes"].values():
+        axis["counts_per_revolution"] = FINE_COUNTS
+        axis["limits"]["following_error_counts"] = FINE_COUNTS // 4
+        axis["limits"]["guarded_error_counts"] = None
+        axis["emulation"]["coulomb_Nm"] = 0.0
+        axis["emulation"]["resolver_noise_counts"] = 0.0
+    return yaml.safe_dump(document, sort_keys=False)
 
 
 def measure_loop(
