@@ -287,6 +287,13 @@ class BusSection(Model):
         return (value, exponent) if value <= 255 else None
 
 
+class RecoverySection(Model):
+    """What is done after a stop that the guard called for; no motion is ever restarted."""
+
+    timeout_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
+    """How long a drive that has gone may take to come back, to be commissioned anew; 0 leaves all as they are."""
+
+
 class EmulatorSection(Model):
     """The emulated machine as a whole."""
 
@@ -306,6 +313,7 @@ class GatewayConfig(Model):
     axes: Annotated[dict[AxisName, AxisSection], Field(min_length=2, max_length=2)]
     bus: BusSection = BusSection()
     guard: GuardSection = GuardSection()
+    recovery: RecoverySection = RecoverySection()
     feed_forward: FeedForwardSection = FeedForwardSection()
     learning: LearningSection = LearningSection()
     emulator: EmulatorSection = EmulatorSection()

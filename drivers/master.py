@@ -140,10 +140,11 @@ class Master:
             self.events.append(node.last_emergency)
 
     def _take_heartbeat(self, node: RemoteNode, data: bytes) -> None:
-        if len(data) != 1:
+        if len(data) > 1:
             return
         try:
-            state = NmtState(data[0] & 0x7F)
+            # Some drives send their boot-up message, and that one alone, without its byte.
+            state = NmtState(data[0] & 0x7F) if data else NmtState.BOOT_UP
         except ValueError:
             return
         node.heartbeat_at_ns = self.now_ns

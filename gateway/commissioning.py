@@ -11,6 +11,7 @@ from drivers import objects
 from drivers.errors import NoAnswerError, NodeError, SdoAbortedError
 from drivers.master import Master, Procedure
 from drivers.nmt import NmtCommand
+from drivers.node import Event
 from drivers.object_dictionary import DataType, Value
 from drivers.pdo import (
     PDO_COB_ID_INVALID,
@@ -44,6 +45,13 @@ TPDO_ENTRIES: Final = (
     MappingEntry(objects.POSITION_ACTUAL_VALUE, 0, 32),
     MappingEntry(objects.TORQUE_ACTUAL_VALUE, 0, 16),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class BootUpMissing(Event):
+    """A node has sent no boot-up message after its reset, but answers by SDO."""
+
+    node_id: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +109,25 @@ def commission(master: Master, nodes: Sequence[NodeSettings], network: NetworkSe
 
     Raises CommissioningError.
     """
-    yield from for_all(nodes, lambda node: master.reset_communication(node.node_id, network.boot_up_timeout_s))
+    yield from for_all(nodes, lambda node: restart(master, node, network))
     yield from for_all(nodes, lambda node: check_identity(master, node))
     yield from for_all(nodes, lambda node: write_parameters(master, node, network))
     yield from for_all(nodes, lambda node: map_pdos(master, node))
     yield from for_all(nodes, lambda node: set_up_heartbeats(master, node, network))
     since_ns = master.now_ns
     yield from for_all(nodes, lambda node: hear_heartbeat(master, node, network, since_ns))
+
+
+def restart(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
+    """Reset a node's communication; one that tells of no boot-up, but answers, is taken as it is, and that is told."""
+    try:
+        yield from master.reset_communication(node.node_id, network.boot_up_timeout_s)
+    except NoAnswerError as silence:
+        try:
+            yield from master.read_int(node.node_id, objects.DEVICE_TYPE, 0, U32)
+        except NodeError:
+            raise silence from None
+        master.events.append(BootUpMissing(master.now_ns, node.node_id))
 
 
 def check_identity(master: Master, node: NodeSettings) -> Procedure[None]:

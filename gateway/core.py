@@ -30,6 +30,7 @@ from gateway.errors import CommissioningError, GatewayError
 from gateway.guard import Condition, Guard, StopReason
 from gateway.learning import LearnedTorque
 from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
+from gateway.recovery import Recovery
 from gateway.sample import Phase
 from gateway.sdo_pacing import SdoPacing
 from mechanism.approach import Point
@@ -41,7 +42,8 @@ SETTLE_S: Final = 0.1
 """Standstill under guard before the motion begins, and after it before the drives are disabled."""
 WATCH_AFTER_DISABLING_S: Final = 0.02
 """For so long the cycle goes on after the drives are disabled, to see and record that they stay where they are."""
-STANDSTILL_TIMEOUT_S: Final = 3.0
+STANDSTILL_TIMEOUT_S: Final = 10.0
+"""An axis without torque and brake may swing for long."""
 START_WINDOW_RAD: Final = math.radians(1.75)
 """How far from the cam's start an axis may stand; more is a linkage that would jump."""
 STANDSTILL_RAD: Final = math.radians(0.18)
@@ -76,10 +78,12 @@ class GatewayCore:
         is_homing_again: bool = False,
         sdo_frames_a_cycle: int = 2,
         approach: Approach | None = None,
+        recovery_timeout_s: float = 0.0,
     ) -> None:
         """``is_homing_again``: home the axes where they stand even if their drives are homed already.
 
         ``approach``: how a machine that does not stand where the plan begins gets onto its cam; None refuses it.
+        ``recovery_timeout_s``: how long a node may be away after a stop before it is given up; 0 recovers nothing.
         ``sdo_frames_a_cycle``: requests and responses that may be on the bus in each cycle.
         """
         self.loop = loop
@@ -107,6 +111,9 @@ class GatewayCore:
         """Before anything is in motion a stop request ends the session where it is."""
         self._events: list[Event] = []
         self.power = AxisPower(master, loop)
+        self._recovery = (
+            Recovery(master, self.power, axes, network, recovery_timeout_s) if recovery_timeout_s > 0.0 else None
+        )
         self._axis_of_node = {axis.node.node_id: number for number, axis in enumerate(axes)}
         self._session: Procedure[None] | None = None
         self._resume_at_ns: int | None = 0
@@ -275,6 +282,8 @@ class GatewayCore:
         self._step("commissioning")
         yield from commission(self.master, self._nodes, self._network)
         self._is_watching_nodes = True
+        if self._recovery is not None:
+            self._recovery.note_commissioned()
         self._step("starting the cycle")
         start_nodes(self.master, self._nodes)
         self.loop.start(self.master.now_ns)
@@ -291,9 +300,31 @@ class GatewayCore:
         yield from for_all(self._nodes, lambda node: self.power.reset_fault(self._axis(node)))
 
     def _home_all(self) -> Procedure[None]:
+        if not self._is_homing_again:
+            yield from self._refuse_half_a_reference()
         for axis in self._axes:
             if axis.homing_method is not None:
                 yield from for_all([axis.node], lambda _, axis=axis: self._home(axis))
+
+    def _refuse_half_a_reference(self) -> Procedure[None]:
+        """To home one axis where it stands while the others know where they are is right at home alone."""
+        homing = [axis for axis in self._axes if axis.homing_method is not None]
+        homed: list[AxisSetup] = []
+        for axis in homing:
+            if (yield from self.power.is_homed(axis)):
+                homed.append(axis)  # noqa: PERF401 - a comprehension cannot wait
+        problems: list[str] = []
+        for axis in homed if len(homed) < len(homing) else ():
+            units = axis.channel.units
+            away = math.remainder(axis.channel.actual, units.counts_per_revolution)
+            if abs(away) > units.counts_in(START_WINDOW_RAD):
+                lost = ", ".join(other.node.name for other in homing if other not in homed)
+                problems.append(
+                    f"axis {lost} has lost its reference while axis {axis.node.name} stands {away:.0f} counts from "
+                    "home; bring the linkage to its home position"
+                )
+        if problems:
+            raise CommissioningError(problems)
 
     def _home(self, axis: AxisSetup) -> Procedure[None]:
         self._step(f"homing axis {axis.node.name}")
@@ -395,9 +426,15 @@ class GatewayCore:
             loop.follow(None)
             loop.phase = Phase.DISABLED
             off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
-            disabled = yield from self.master.wait_for(
-                lambda: all(state_of(axis.channel.statusword) in off for axis in self._axes), DISABLE_TIMEOUT_S
-            )
+
+            def is_off() -> bool:
+                return all(state_of(axis.channel.statusword) in off for axis in self._axes)
+
+            disabled = yield from self.master.wait_for(is_off, DISABLE_TIMEOUT_S)
+            if self._recovery is not None and self._guard.stopped_by not in {None, StopReason.OPERATOR}:
+                self._step("recovering the axes")
+                self._events += yield from self._recovery.run()
+                disabled = is_off()
             if not disabled and self.failure is None:
                 states = ", ".join(f"{a.node.name} '{state_of(a.channel.statusword).value}'" for a in self._axes)
                 self.failure = GatewayError(f"the drives did not confirm that they are disabled: {states}")

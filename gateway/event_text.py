@@ -7,8 +7,10 @@ from typing import Final
 
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
 from drivers.node import Event
+from gateway.commissioning import BootUpMissing
 from gateway.core import StepReached
 from gateway.guard import Condition, GuardTripped
+from gateway.recovery import AxisRecovered
 
 _UNITS: Final = {
     Condition.FOLLOWING_ERROR: "counts",
@@ -38,6 +40,14 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return "heartbeat_lost", f"node {node_id}: no heartbeat for {timeout_s:g} s", {"node_id": node_id}
         case BootUpReceived(_, node_id):
             return "boot_up", f"node {node_id} has booted up", {"node_id": node_id}
+        case AxisRecovered(_, axis, is_ready, is_commissioned_anew, said):
+            return (
+                "recovery",
+                f"axis {axis}: {said}",
+                {"axis": axis, "is_ready": is_ready, "anew": is_commissioned_anew},
+            )
+        case BootUpMissing(_, node_id):
+            return "boot_up", f"node {node_id} answers, but sends no boot-up message", {"node_id": node_id}
         case NodeStateChanged(_, node_id, state):
             text = f"node {node_id} is {state.name.lower().replace('_', '-')}"
             return "nmt_state", text, {"node_id": node_id, "state": state.name.lower()}

@@ -76,6 +76,12 @@ class AxisPower:
                 raise NoAnswerError(node_id, f"mode of operation {int(mode)} (6061h stays {active})", MODE_TIMEOUT_S)
             yield from self._master.pause(MODE_POLL_S)
 
+    def is_homed(self, axis: AxisSetup) -> Procedure[bool]:
+        """Whether the drive has a reference: bit 12 of the statusword in the homing mode, in which it is left."""
+        yield from self.set_mode(axis, ModeOfOperation.HOMING)
+        yield from self.cycles(START_CYCLES)
+        return bool(axis.channel.statusword & Statusword.MODE_SPECIFIC_12)
+
     def home(self, axis: AxisSetup, is_homing_again: bool) -> Procedure[bool]:
         """Homing on the current position (CiA 402-2, methods 35 and 37); False if the drive is homed already.
 
@@ -84,9 +90,8 @@ class AxisPower:
         """
         node_id, channel = axis.node.node_id, axis.channel
         yield from self._master.write(node_id, objects.HOMING_METHOD, 0, DataType.INTEGER8, axis.homing_method or 0)
-        yield from self.set_mode(axis, ModeOfOperation.HOMING)
-        yield from self.cycles(START_CYCLES)
-        if channel.statusword & Statusword.MODE_SPECIFIC_12 and not is_homing_again:
+        is_homed = yield from self.is_homed(axis)
+        if is_homed and not is_homing_again:
             return False
         yield from self.enable(axis)
         channel.controlword = cia402.COMMAND_ENABLE_OPERATION | int(Controlword.MODE_SPECIFIC_4)

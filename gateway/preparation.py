@@ -310,6 +310,7 @@ def build_core(
         is_homing_again,
         config.bus.sdo_frames_a_cycle,
         approach,
+        config.recovery.timeout_s,
     )
 
 

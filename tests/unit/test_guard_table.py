@@ -48,8 +48,8 @@ class Refusal:
         Refusal(
             "limit_deg: 20", "limit_deg: 0.17", "guard.cam_window.limit_deg: 0.17 would always trip, it is less than 2"
         ),
-        Refusal("limit_deg: 0.4", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
-        Refusal("limit_deg: 0.4", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
+        Refusal("limit_deg: 1.0", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
+        Refusal("limit_deg: 1.0", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
         Refusal("limit_mm: 50", "limit_mm: 800", "can never trip, the linkage reaches 400 mm (bound: below 800)"),
         Refusal("limit_mm: 50", "limit_mm: 1", "would always trip, the resolvers tell the end effector to 1.2 mm"),
         Refusal(

@@ -49,7 +49,13 @@ def test_boot_up_and_state_changes_are_events_once():
     assert master.events == [BootUpReceived(5, 1), NodeStateChanged(7, 1, NmtState.OPERATIONAL)]
 
 
-@pytest.mark.parametrize("data", ["", "0500", "63"])
+def test_a_boot_up_message_without_its_byte_is_one():
+    master = make_master()
+    master.receive(Frame(0x701), 5)
+    assert master.events == [BootUpReceived(5, 1)]
+
+
+@pytest.mark.parametrize("data", ["0500", "63"])
 def test_a_heartbeat_that_is_none_is_passed_over(data):
     master = make_master()
     master.receive(Frame(0x701, bytes.fromhex(data)), 5)

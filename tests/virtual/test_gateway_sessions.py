@@ -300,7 +300,8 @@ def test_an_emergency_makes_a_quick_stop():
     assert session.core.stopped_by in {StopReason.EMERGENCY, StopReason.DRIVE_FAULT}
     assert "emergency" in {trip.condition.value for trip in session.trips} | {"emergency"}
     assert Phase.QUICK_STOP in session.sink.samples["phase"]
-    assert session.states()[0] is State.FAULT
+    # The fault has been reset after the stop, and nothing was enabled again.
+    assert session.states() == [State.SWITCH_ON_DISABLED] * 2
     session.assert_safe()
 
 

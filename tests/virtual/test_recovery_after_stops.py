@@ -1,0 +1,96 @@
+"""After a stop: which axis is commissioned anew, what becomes of its fault and reference, and that nothing moves."""
+
+import itertools
+
+import pytest
+from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
+from test_approach_from_anywhere import Again
+
+from drivers.cia402 import State, state_of
+from gateway.recovery import AxisRecovered
+from gateway.sample import Phase
+from sim_drive.faults import Fault, FaultKind
+
+AT_S = at_theta2(100)
+LOST_REFERENCE = "its reference is lost: bring the linkage to its home position"
+
+
+def recover(*faults):
+    frames = []
+    run = Guarded(*faults, cycles=2, trace=lambda at_ns, frame: frames.append((at_ns * 1e-9, frame))).to_end()
+    return run, [(at_s, frame) for at_s, frame in frames if at_s >= AT_S]
+
+
+def outcomes(run):
+    return {event.axis: event for event in run.events if isinstance(event, AxisRecovered)}
+
+
+def resets_of(frames, node):
+    """Rising edges of the fault reset bit in the controlwords sent to a node."""
+    words = [frame.data[0] for _, frame in frames if frame.cob_id == 0x200 + node]
+    return sum(1 for one, two in itertools.pairwise(words) if not one & 0x80 and two & 0x80)
+
+
+def restarts_of(frames, node):
+    return sum(1 for _, frame in frames if frame.cob_id == 0 and frame.data == bytes((0x82, node)))
+
+
+def assert_at_rest(run):
+    phases = [Phase(int(sample[12])) for sample in run.samples]
+    stopped = phases.index(Phase.QUICK_STOP)
+    assert not {Phase.RAMP_UP, Phase.CAM, Phase.APPROACH} & set(phases[stopped:])
+    assert run.is_without_torque
+    assert run.strain(run.bus.now_ns * 1e-9 - 0.2).rest_s == 0.0
+
+
+def test_a_fault_is_reset_by_one_edge_and_the_run_may_begin_anew_from_there():
+    run, frames = recover(Fault(FaultKind.OVER_CURRENT, SERVO, AT_S))
+    told = outcomes(run)
+    assert told["servo"].text == "fault reset, ready for a new run"
+    assert told["cv"].text == "ready for a new run"
+    assert [resets_of(frames, node) for node in (CV, SERVO)] == [0, 1]
+    assert [restarts_of(frames, node) for node in (CV, SERVO)] == [0, 0]
+    assert [state_of(axis.statusword) for axis in run.core.loop.axes] == [State.SWITCH_ON_DISABLED] * 2
+    assert_at_rest(run)
+    Again(run).to_end().assert_approached_and_ran_home()
+
+
+def test_a_cause_that_goes_on_keeps_its_fault():
+    run, frames = recover(Fault(FaultKind.SAFE_TORQUE_OFF, CV, AT_S))
+    assert not outcomes(run)["cv"].is_ready
+    assert "has a fault that cannot be reset (last EMCY FF30h)" in outcomes(run)["cv"].text
+    assert resets_of(frames, CV) == 1
+    assert state_of(run.core.loop.axes[0].statusword) is State.FAULT
+    assert_at_rest(run)
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (Fault(FaultKind.POWER_CYCLE, SERVO, AT_S, 0.7), f"commissioned anew, {LOST_REFERENCE}"),
+        (Fault(FaultKind.NODE_RESET, SERVO, AT_S), f"commissioned anew, {LOST_REFERENCE}"),
+        (Fault(FaultKind.BUS_OFF, SERVO, AT_S, 0.3), "commissioned anew, fault reset, ready for a new run"),
+    ],
+)
+def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, text):
+    run, frames = recover(fault)
+    assert outcomes(run)["servo"].text == text
+    assert outcomes(run)["cv"].text == "ready for a new run"
+    assert [restarts_of(frames, node) for node in (CV, SERVO)] == [0, 1]
+    assert run.core.failure is None
+    assert_at_rest(run)
+
+
+def test_an_axis_without_a_reference_is_not_homed_away_from_home():
+    run, _ = recover(Fault(FaultKind.NODE_RESET, SERVO, AT_S))
+    again = Again(run).to_end()
+    assert "axis servo has lost its reference while axis cv stands" in str(again.core.failure)
+    assert not any(drive.is_powered for drive in again.machine.drives)
+    assert Phase.APPROACH not in {Phase(int(sample[12])) for sample in again.samples}
+
+
+def test_a_node_that_stays_away_is_given_up():
+    run, frames = recover(Fault(FaultKind.POWER_CYCLE, CV, AT_S))
+    assert outcomes(run)["cv"].text == f"node 1 has not come back within {PAPER.recovery.timeout_s:g} s"
+    assert restarts_of(frames, CV) == 0
+    assert "did not confirm that they are disabled" in str(run.core.failure)
