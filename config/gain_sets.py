@@ -6,8 +6,10 @@ from typing import Annotated, Final
 import yaml
 from pydantic import Field
 
+from config.emulation_section import GainsSection
 from config.loading import SHIPPED, parse_config, parse_model, read_text
-from config.schema import GainsSection, GatewayConfig, Model
+from config.model import Model
+from config.schema import GatewayConfig
 from config.torque_sections import FeedForwardSection, LearningSection
 
 LOOSE_FROZEN_DEG: Final = 3.0

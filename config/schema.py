@@ -8,12 +8,14 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from config.bus_budget import LATEST_TPDO, MAX_BUS_LOAD, BusBudget, bus_budget
+from config.emulation_section import EmulatedDriveSection
 from config.guard_section import GuardSection
-from config.model import AxisName, Model, NotNegative, Point, Positive
-from config.quirks import Quirk
+from config.model import AxisName, Model, Point, Positive
 from config.torque_sections import FeedForwardSection, LearningSection
 from drivers.nmt import MAX_NODE_ID
 
+SERVO_RATE_HZ: Final = 1024
+"""Rate of the emulated drives' position controllers, the paper's."""
 VIRTUAL_BIT_RATE: Final = 1_000_000_000
 """What a channel without a bit rate has in virtual time."""
 
@@ -30,6 +32,17 @@ class FiveBarSection(Model):
     cv_pivot_mm: Point = (0.0, 0.0)
     servo_pivot_mm: Point
 
+    def linkage_sine(self, theta2_deg: float, theta5_deg: float) -> float:
+        """Sine of the angle between links q and r, 0 where they are in line or do not reach each other."""
+        a = self._crank_end(self.cv_pivot_mm, self.p_mm, theta2_deg)
+        d = self._crank_end(self.servo_pivot_mm, self.s_mm, theta5_deg)
+        cosine = (self.q_mm**2 + self.r_mm**2 - math.dist(a, d) ** 2) / (2.0 * self.q_mm * self.r_mm)
+        return math.sqrt(max(1.0 - cosine * cosine, 0.0))
+
+    def _crank_end(self, pivot_mm: tuple[float, float], length_mm: float, angle_deg: float) -> tuple[float, float]:
+        angle = math.radians(angle_deg)
+        return pivot_mm[0] + length_mm * math.cos(angle), pivot_mm[1] + length_mm * math.sin(angle)
+
 
 class LinkSection(Model):
     """A link as a rigid body; ``com_m`` is measured along the link from its first joint (see mechanism.dynamics)."""
@@ -38,6 +51,11 @@ class LinkSection(Model):
     com_m: Annotated[float, Field(ge=-10.0, le=10.0)]
     com_perp_m: Annotated[float, Field(ge=-10.0, le=10.0)] = 0.0
     inertia_com_kgm2: Annotated[float, Field(ge=0.0, le=1000.0)]
+
+    @property
+    def inertia_about_joint_kgm2(self) -> float:
+        """Moment of inertia about the first joint."""
+        return self.inertia_com_kgm2 + self.mass_kg * (self.com_m**2 + self.com_perp_m**2)
 
 
 class LinksSection(Model):
@@ -119,104 +137,6 @@ class LimitsSection(Model):
                 f" following_error_counts {self.following_error_counts}"
             )
         return self
-
-
-class GainsSection(Model):
-    """Gains of the paper's eq. (5), integers over 256 (eq. 6)."""
-
-    K_P: Annotated[int, Field(ge=0, le=1_000_000)]
-    K_I: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    K_D: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    K_V: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-    K_F: Annotated[int, Field(ge=0, le=1_000_000)] = 0
-
-
-class SwitchesSection(Model):
-    """Switches and index pulse of an emulated axis, by the angle of its link as the plant has it."""
-
-    negative_limit_deg: float | None = None
-    """On at and below; null for a switch that is not fitted."""
-    positive_limit_deg: float | None = None
-    """On at and above."""
-    home_deg: tuple[float, float] | None = None
-    """On from the first angle to the second."""
-    index_deg: float = 0.0
-    """The encoder's index pulse, once a revolution."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        low, high = self.negative_limit_deg, self.positive_limit_deg
-        if low is not None and high is not None and low >= high:
-            raise ValueError(f"negative_limit_deg: {low:g} is not below positive_limit_deg: {high:g}")
-        if self.home_deg is not None and self.home_deg[0] >= self.home_deg[1]:
-            raise ValueError(f"home_deg: {self.home_deg[0]:g} is not below {self.home_deg[1]:g}")
-        return self
-
-
-class FrictionLaw(Enum):
-    """What dry friction does around standstill."""
-
-    STICK_SLIP = "stick_slip"
-    """It holds an axis that stands, exactly."""
-    SMOOTHED = "smoothed"
-    """It is a steep function of velocity, and an axis under load creeps."""
-
-
-class MotorSection(Model):
-    """The electrical side of motor and amplifier: what it draws, and what bounds the torque at speed."""
-
-    torque_constant_Nm_per_A: Positive = 0.45
-    """The back-EMF constant in V s/rad too."""
-    resistance_ohm: Positive = 1.5
-    supply_voltage_V: Positive | None = None
-    """What the amplifier can put on the motor, either way; null for as much as it takes."""
-    regeneration: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Share of braking power that the supply takes back; the rest is heat in a brake chopper."""
-    idle_W: NotNegative = 0.0
-    """What the amplifier draws as long as it has its supply."""
-
-
-class CouplingSection(Model):
-    """A flexible coupling between motor and link; the resolver, friction and the brake are on the motor's side."""
-
-    stiffness_Nm_per_rad: Positive
-    damping_Nms_per_rad: NotNegative = 0.0
-    backlash_deg: Annotated[float, Field(ge=0.0, le=45.0)] = 0.0
-    """Play, from one end to the other."""
-    link_side_inertia_kgm2: NotNegative = 0.0
-    """The coupling's half on the link; ``inertia_kgm2`` is then what turns with the motor."""
-
-
-class EmulatedDriveSection(Model):
-    """Motor and amplifier of the emulated drive; a gateway against real drives does not read it."""
-
-    gains: GainsSection
-    torque_per_volt_Nm: Positive
-    torque_time_constant_s: Annotated[float, Field(ge=1e-5, le=1.0)]
-    """1 / (2 pi bandwidth) of the current loop."""
-    torque_limit_Nm: Positive
-    inertia_kgm2: Positive
-    coulomb_Nm: NotNegative = 0.0
-    viscous_Nms: NotNegative = 0.0
-    friction_law: FrictionLaw = FrictionLaw.STICK_SLIP
-    friction_smoothing_rad_per_s: Annotated[float, Field(ge=1e-4, le=100.0)] = 0.05
-    """Smoothed friction reaches tanh(1) = 76 % at this velocity."""
-    breakaway_Nm: NotNegative = 0.0
-    """What holds an axis that stands, where that is more than ``coulomb_Nm``; with stick_slip alone."""
-    brake_torque_Nm: NotNegative
-    motor: MotorSection = MotorSection()
-    coupling: CouplingSection | None = None
-    """null for a motor that sits on its link rigidly."""
-    resolver_noise_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    resolver_eccentricity_counts: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    """Amplitude of an error once a revolution, of a rotor that does not run true."""
-    resolver_eccentricity_deg: float = 0.0
-    """Angle at which that error passes zero, rising."""
-    output_delay_periods: Annotated[int, Field(ge=0, le=1)] = 0
-    """Servo periods (1/1024 s) between the position and the output that the controller makes of it."""
-    switches: SwitchesSection = SwitchesSection()
-    quirks: frozenset[Quirk] = frozenset()
-    """Habits of real drives that the emulated one is to have."""
 
 
 class Role(Enum):
@@ -407,6 +327,22 @@ class GatewayConfig(Model):
                 f"{self.bus.bit_rate} bit/s, SYNC, PDOs, heartbeats and the SDO reserve would take {budget.load:.0%} "
                 f"of it (bound {MAX_BUS_LOAD:.0%}), {budget.shortest_cycle_us} us would fit; on a channel without a "
                 "bit rate say is_virtual: true"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _machine_can_be_emulated(self) -> Self:
+        links = self.machine.links
+        step_s = 1.0 / (SERVO_RATE_HZ * self.emulator.sub_steps)
+        for name, link in zip(self.axis_names, (links.p, links.s), strict=True):
+            self.axes[name].emulation.check_steps(f"axes.{name}.emulation", link.inertia_about_joint_kgm2, step_s)
+        home = [axis.home_angle_deg for axis in self.ordered_axes]
+        sine = self.machine.five_bar.linkage_sine(home[0], home[1])
+        bound = self.machine.minimum_transmission_sine
+        if sine < bound:
+            raise ValueError(
+                f"axes: at home_angle_deg {home[0]:g} and {home[1]:g} the linkage cannot stand, the sine of the angle "
+                f"between links q and r is {sine:.3g} (bound {bound:g}, machine.minimum_transmission_sine)"
             )
         return self
 

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Final
 
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
+from config.emulation_section import FrictionLaw
 from config.loading import SHIPPED
 from config.quirks import Quirk
-from config.schema import AxisSection, FrictionLaw, GatewayConfig
+from config.schema import AxisSection, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
+from sim_drive.compliant import CompliantPlant, Coupling
 from sim_drive.drive import Drive
 from sim_drive.driveline import MotorParameters
 from sim_drive.energy_meter import attach_energy_meter
@@ -63,7 +65,7 @@ def build_machine(
         substeps=config.emulator.sub_steps,
     )
     theta2, theta5 = home_angles(config)
-    plant = CoupledPlant(parameters, theta2, theta5)
+    plant = _plant(parameters, (_coupling(axes[0]), _coupling(axes[1])), theta2, theta5)
     _attach_meters(drives, plant)
     return EmulatedMachine(drives, plant, [_machine_axis(axis) for axis in axes], start_ns, seed, record_ticks)
 
@@ -141,6 +143,26 @@ def drive_settings(axis: AxisSection, config: GatewayConfig) -> DriveSettings:
         missing_set_point_limit=config.emulator.missing_sync_limit,
         switches=switches(axis),
         quirks=axis.emulation.quirks,
+    )
+
+
+def _plant(
+    parameters: PlantParameters, couplings: tuple[Coupling | None, Coupling | None], theta2: float, theta5: float
+) -> Plant:
+    if couplings == (None, None):
+        return CoupledPlant(parameters, theta2, theta5)
+    return CompliantPlant(parameters, couplings, theta2, theta5)
+
+
+def _coupling(axis: AxisSection) -> Coupling | None:
+    section = axis.emulation.coupling
+    if section is None:
+        return None
+    return Coupling(
+        stiffness_N_m_per_rad=section.stiffness_Nm_per_rad,
+        damping_N_m_s_per_rad=section.damping_Nms_per_rad,
+        backlash_rad=radians(section.backlash_deg),
+        link_side_inertia_kg_m2=section.link_side_inertia_kgm2,
     )
 
 

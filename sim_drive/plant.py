@@ -36,6 +36,7 @@ __all__ = [
     "AxisEnergy",
     "AxisState",
     "CoupledPlant",
+    "FiveBarPlant",
     "FreeAxisParameters",
     "FreeAxisPlant",
     "MotorParameters",
@@ -105,8 +106,8 @@ class Plant(Protocol):
         ...
 
 
-class CoupledPlant:
-    """The five-bar with both motors: two axes, 0 the CV axis (theta2), 1 the servo axis (theta5).
+class FiveBarPlant:
+    """What every five-bar with both motors has: two axes, 0 the CV axis (theta2), 1 the servo axis (theta5).
 
     Where the linkage comes near a singular position, or would have to open, it tears: the plant records the time,
     stands still from then on and ignores its torques. What a torn machine does is not modelled; it has to be seen, not
@@ -115,19 +116,9 @@ class CoupledPlant:
     Raises ValueError where the linkage is singular, or does not close, at the initial angles (rad).
     """
 
-    __slots__ = (
-        "_constants",
-        "_dynamics",
-        "_settings",
-        "_state",
-        "_step_s",
-        "_steps",
-        "_torn_at_s",
-        "_values",
-        "parameters",
-    )
+    __slots__ = ("_dynamics", "_settings", "_state", "_step_s", "_steps", "_torn_at_s", "_values", "parameters")
 
-    def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float) -> None:
+    def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float, state_size: int) -> None:
         self.parameters = parameters
         dynamics = parameters.dynamics
         self._dynamics = dynamics.to_array()
@@ -147,20 +138,10 @@ class CoupledPlant:
             ]
         )
         self._values: AxisState = (theta2_rad, theta5_rad, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._state = np.zeros(METERED_SIZE)
+        self._state = np.zeros(state_size)
         self._state[:MOTION_SIZE] = self._values
         self._steps = 0
         self._torn_at_s: float | None = None
-        self._constants = (
-            self._dynamics,
-            self._settings,
-            int(parameters.closure),
-            parameters.singular_sine,
-            self._step_s,
-            parameters.substeps,
-        )
-        # Compiled here rather than in the first servo period, where it would make a real-time host seconds late.
-        advance_five_bar(self._state.copy(), *self._constants, 0.0, 0.0, False, False)
 
     @property
     def axis_count(self) -> int:
@@ -178,11 +159,6 @@ class CoupledPlant:
         return self._steps * SERVO_PERIOD_S
 
     @property
-    def kernel_arguments(self) -> tuple[Float, Float, int, float, float, int]:
-        """What `advance_five_bar` is called with between the state and the commands."""
-        return self._constants
-
-    @property
     def state(self) -> AxisState:
         """theta2, theta5, their velocities and accelerations, and both amplifier torques (rad, s, N m)."""
         return self._values
@@ -197,14 +173,8 @@ class CoupledPlant:
         self._steps = 0
         self._torn_at_s = None
 
-    def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
-        """One servo period (1/1024 s) under constant torque commands (N m) for the CV and the servo axis."""
-        self._steps += 1
-        if self._torn_at_s is not None:
-            return
-        command2, command5 = torque_commands_Nm
-        brake2, brake5 = brakes_engaged
-        after = advance_five_bar(self._state, *self._constants, command2, command5, brake2, brake5)
+    def _take(self, after: tuple[float, float, float, float, float, float, float, float, int]) -> None:
+        """Take over what a kernel has answered."""
         self._values = after[:8]
         torn = after[8]
         if torn:
@@ -224,6 +194,39 @@ class CoupledPlant:
         """Torque of the amplifier in N m at the end of the last servo period."""
         return self._values[axis + 6]
 
+
+class CoupledPlant(FiveBarPlant):
+    """The five-bar with both motors rigidly on their links; see FiveBarPlant."""
+
+    __slots__ = ("_constants",)
+
+    def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float) -> None:
+        super().__init__(parameters, theta2_rad, theta5_rad, METERED_SIZE)
+        self._constants = (
+            self._dynamics,
+            self._settings,
+            int(parameters.closure),
+            parameters.singular_sine,
+            self._step_s,
+            parameters.substeps,
+        )
+        # Compiled here rather than in the first servo period, where it would make a real-time host seconds late.
+        advance_five_bar(self._state.copy(), *self._constants, 0.0, 0.0, False, False)
+
+    @property
+    def kernel_arguments(self) -> tuple[Float, Float, int, float, float, int]:
+        """What `advance_five_bar` is called with between the state and the commands."""
+        return self._constants
+
+    def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
+        """One servo period (1/1024 s) under constant torque commands (N m) for the CV and the servo axis."""
+        self._steps += 1
+        if self._torn_at_s is not None:
+            return
+        command2, command5 = torque_commands_Nm
+        brake2, brake5 = brakes_engaged
+        self._take(advance_five_bar(self._state, *self._constants, command2, command5, brake2, brake5))
+
     def energy(self) -> float:
         """Kinetic and potential energy in J."""
         x2, x5, v2, v5 = self._values[:4]
@@ -238,4 +241,4 @@ class CoupledPlant:
         """What an axis has drawn, done and lost so far."""
         first = MOTION_SIZE + ENERGY_COUNT * axis
         counted: list[float] = self._state[first : first + ENERGY_COUNT].tolist()
-        return energy_of(counted, self.parameters.axes[axis].motor, self._steps * SERVO_PERIOD_S)
+        return energy_of(counted, self.parameters.axes[axis].motor, self.time_s)

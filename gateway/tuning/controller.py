@@ -11,7 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from config.schema import AxisSection, GainsSection
+from config.emulation_section import GainsSection
+from config.schema import AxisSection
 from gateway.errors import UsageError
 
 Float = NDArray[np.float64]

@@ -3,8 +3,8 @@
 import pytest
 from drive_bench import MS, Bench
 
+from config.emulation_section import SwitchesSection
 from config.loading import load_config
-from config.schema import SwitchesSection
 from sim_drive.assembly import switches
 from sim_drive.settings import DriveSettings
 from sim_drive.switches import DigitalInput, Switches
