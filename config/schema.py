@@ -16,6 +16,8 @@ from drivers.nmt import MAX_NODE_ID
 
 SERVO_RATE_HZ: Final = 1024
 """Rate of the emulated drives' position controllers, the paper's."""
+SINGULAR_SHARE: Final = 0.5
+"""The emulated linkage tears at this share of the transmission sine that the configuration keeps as its distance."""
 VIRTUAL_BIT_RATE: Final = 1_000_000_000
 """What a channel without a bit rate has in virtual time."""
 
@@ -338,11 +340,11 @@ class GatewayConfig(Model):
             self.axes[name].emulation.check_steps(f"axes.{name}.emulation", link.inertia_about_joint_kgm2, step_s)
         home = [axis.home_angle_deg for axis in self.ordered_axes]
         sine = self.machine.five_bar.linkage_sine(home[0], home[1])
-        bound = self.machine.minimum_transmission_sine
+        bound = SINGULAR_SHARE * self.machine.minimum_transmission_sine
         if sine < bound:
             raise ValueError(
                 f"axes: at home_angle_deg {home[0]:g} and {home[1]:g} the linkage cannot stand, the sine of the angle "
-                f"between links q and r is {sine:.3g} (bound {bound:g}, machine.minimum_transmission_sine)"
+                f"between links q and r is {sine:.3g} (bound {bound:g}, half of machine.minimum_transmission_sine)"
             )
         return self
 

@@ -11,7 +11,7 @@ from config.conversion import closure_at_home, desired_curve, dynamics_parameter
 from config.emulation_section import FrictionLaw
 from config.loading import SHIPPED
 from config.quirks import Quirk
-from config.schema import AxisSection, GatewayConfig
+from config.schema import SINGULAR_SHARE, AxisSection, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
@@ -34,9 +34,6 @@ FREE_AXIS_GAINS: Final = (4000, 0, 0, 45_000, 45_000)
 """3020h of a drive of ``free_machine``: the paper's, which suit the inertia."""
 
 _FEW_NODES: Final = 3
-
-SINGULAR_SHARE: Final = 0.5
-"""The plant tears at this share of the transmission sine that the configuration keeps as its distance."""
 
 
 def build_machine(
