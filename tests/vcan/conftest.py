@@ -11,7 +11,7 @@ import yaml
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PATIENCE_S = 240.0
-LATENESS = ("missed_tpdo", "missed_deadline", "axis_silent", "sync_lost")
+LATENESS = ("missed_tpdo", "missed_deadline", "axis_silent")
 """Conditions of the guard that a slow computer brings about."""
 
 
@@ -24,6 +24,7 @@ def unhurried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config["emulator"]["missing_sync_limit"] = 1000
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 1000}
     config["guard"] |= {name: {"reaction": "warn"} for name in LATENESS}
+    config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
     path = tmp_path_factory.mktemp("machine") / "unhurried.yaml"
     path.write_text(yaml.safe_dump(config))
     return path

@@ -80,8 +80,9 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
     config["emulator"]["missing_sync_limit"] = 1000
     config["bus"] |= {"cycle_us": CYCLE_US, "heartbeat_timeout_ms": 1000, "is_virtual": True}
-    warned = ("missed_tpdo", "missed_deadline", "axis_silent", "sync_lost", "following_error", "frozen_actual")
+    warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error")
     config["guard"] |= {name: {"reaction": "warn"} for name in warned}
+    config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
     path = tmp_path_factory.mktemp("bench") / "bench.yaml"
     path.write_text(yaml.safe_dump(config))
     return path
