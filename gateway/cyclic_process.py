@@ -5,6 +5,7 @@ session. It outlives nobody: a parent that dies is a request for a controlled st
 """
 
 import json
+import os
 import signal
 import sys
 import time
@@ -258,7 +259,8 @@ def main() -> int:
         ring.set_state(RunState.FAILED, 1)
         raise
     finally:
-        ring.close(unlink=False)
+        # The ring is the parent's to remove, unless it is dead; who reads it keeps it.
+        ring.close(unlink=os.getppid() != job.parent_pid)
 
 
 if __name__ == "__main__":

@@ -213,6 +213,7 @@ def _follow(
     total = (prepared.plan.end_position - prepared.plan.at(0.0)[0]) / math.tau
     first: float | None = None
     is_recorder_lost = False
+    tell = on_event or (lambda _: None)
     while True:
         with suppress(subprocess.TimeoutExpired):
             loop.wait(POLL_S)
@@ -221,8 +222,9 @@ def _follow(
             reader.request_stop(switch.request)
         if recorder.poll() is not None and not is_over and not is_recorder_lost:
             is_recorder_lost = True
-            # A machine that nobody records is brought to rest, on the cam; the cycle itself never waits for a recorder.
-            reader.request_stop(StopRequest.CONTROLLED_STOP)
+            # A run that nobody records goes on: the machine is as safe as before, and the cycle never waits for a disk.
+            ending = _ending(recorder.returncode, "").partition(" (")[0]
+            tell({"kind": "recorder_lost", "text": f"the recorder {ending}: the run goes on, unrecorded"})
         samples, _ = reader.read_new()
         if len(samples):
             position = float(samples["master_position"][-1])
@@ -234,8 +236,7 @@ def _follow(
                 step = text
             elif kind == "failure":
                 failures.append(text)
-            if on_event is not None:
-                on_event(dict(event.data))
+            tell(dict(event.data))
         if not is_over and _is_hung(reader):
             failures.append(f"the cyclic process gave no sign of life for {HUNG_S:g} s and was killed")
             loop.kill()

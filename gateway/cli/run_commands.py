@@ -113,7 +113,7 @@ def _run_on_bus(
     def on_event(event: dict[str, Any]) -> None:
         if event.get("kind") == "learning":
             console.print(event["text"], soft_wrap=True, markup=False)
-        elif event.get("kind") in {"guard", "emergency", "heartbeat_lost"}:
+        elif event.get("kind") in {"guard", "emergency", "heartbeat_lost", "recorder_lost"}:
             console.print(f"  {event['text']}", style="yellow", markup=False)
         elif event.get("kind") == "realtime" and not event.get("is_on"):
             console.print(f"  {event['text']}", style="dim", markup=False)
@@ -164,6 +164,7 @@ def _run_virtually(
 ) -> float:
     """Carry out the run in virtual time; returns machine seconds per second. ``machine``: not the configuration's."""
     from gateway.core import GatewayCore
+    from gateway.cyclic_process import pass_on_stop
     from gateway.session import StopSwitch
     from gateway.virtual_run import run_virtual
     from sim_drive.assembly import build_machine
@@ -173,13 +174,13 @@ def _run_virtually(
     switch = StopSwitch()
     started = time.monotonic()
     reached_s = 0.0
+    answered = 0
     with _progress() as (progress, task), switch.installed():
 
         def on_progress(at_s: float, core: GatewayCore) -> None:
-            nonlocal reached_s
+            nonlocal reached_s, answered
             reached_s = at_s
-            if switch.request:
-                core.request_stop()
+            answered = pass_on_stop(core, switch.request, answered)
             speed = at_s / max(time.monotonic() - started, 1e-9)
             progress.update(
                 task,
