@@ -213,7 +213,7 @@ def _follow(
     total = (prepared.plan.end_position - prepared.plan.at(0.0)[0]) / math.tau
     first: float | None = None
     is_recorder_lost = False
-    tell = on_event or (lambda _: None)
+    tell = on_event or _tell_nobody
     while True:
         with suppress(subprocess.TimeoutExpired):
             loop.wait(POLL_S)
@@ -245,6 +245,10 @@ def _follow(
             on_progress(Progress((time.monotonic_ns() - start_ns) * 1e-9, step, turns, total))
         if is_over:
             return
+
+
+def _tell_nobody(_event: dict[str, Any]) -> None:
+    pass
 
 
 def _is_hung(reader: RingReader) -> bool:
