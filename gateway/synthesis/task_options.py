@@ -63,15 +63,20 @@ def default_weights(method: Method, timing: Timing, has_zones: bool) -> dict[Ter
 
 
 def weighted_terms(texts: Sequence[str], defaults: dict[Term, float]) -> tuple[WeightedTerm, ...]:
-    """``defaults`` changed by texts like "peak-torque=20,swept-area=0": 0 reports a term without counting it.
+    """``defaults`` changed by texts like "power=20,swept-area=0,peak-torque=off".
 
-    In the order of `Term`. Raises UsageError.
+    A term with weight 0 is evaluated and reported without counting, one that is off is not evaluated.
+
+    The terms come in the order of `Term`. Raises UsageError.
     """
     weights = dict(defaults)
     for name, text in _pairs(texts, "--weights"):
         term = TERM_NAMES.get(name)
         if term is None:
             raise UsageError(f"--weights: {name[:40]} is no term (there are: {', '.join(TERM_NAMES)})")
+        if text == "off":
+            weights.pop(term, None)
+            continue
         weights[term] = _number(text, f"--weights: {name}")
         if not 0.0 <= weights[term] <= 1e12:
             raise UsageError(f"--weights: {name} is {text}, bound 0 to 1e12")

@@ -7,9 +7,10 @@ the time of its slice and nothing else.
 import importlib
 import multiprocessing
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from typing import Any, Final, Protocol
 
 from gateway.errors import GatewayError, UsageError
@@ -19,6 +20,7 @@ MAXIMUM_WORKERS: Final = 256
 MAXIMUM_RESTARTS: Final = 5
 CONNECT_TIMEOUT_S: Final = 10
 """How long a dask scheduler may take to answer at first."""
+CLOSE_TIMEOUT_S: Final = 3
 
 
 class WorkersLostError(GatewayError):
@@ -145,7 +147,7 @@ class LocalProcesses:
 class DaskCluster:
     """The workers of a dask scheduler; the scheduler hands a dead worker's slices to another one."""
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         if not address.startswith(("tcp://", "tls://")):
             raise UsageError(f"--dask {address[:80]}: an address looks like tcp://127.0.0.1:8786")
         try:
@@ -154,7 +156,7 @@ class DaskCluster:
             raise UsageError("--dask needs distributed (pip install 'drive-gateway[dask]')") from None
         try:
             self._client: Any = self._distributed.Client(
-                address, timeout=CONNECT_TIMEOUT_S, set_as_default=False, direct_to_workers=False
+                address, timeout=timeout_s, set_as_default=False, direct_to_workers=False
             )
         except (OSError, ValueError, TimeoutError) as error:
             raise GatewayError(f"--dask {address}: no scheduler answers ({str(error)[:120]})") from None
@@ -163,21 +165,46 @@ class DaskCluster:
         self._deaths = 0
 
     @property
+    def worker_count(self) -> int:
+        """How many workers the cluster has."""
+        return len(self._client.nthreads())
+
+    def wait_for_workers(self, count: int, timeout_s: float) -> None:
+        """Wait until the cluster has so many workers. Raises WorkersLostError."""
+        try:
+            self._client.wait_for_workers(count, timeout_s)
+        except TimeoutError:
+            raise WorkersLostError(f"--dask {self._address}: fewer than {count} workers") from None
+
+    @property
     def capacity(self) -> int:
         """Two slices a thread of the cluster, so that none has to wait for the next."""
-        threads: dict[str, int] = self._client.nthreads()
+        with self._answered():
+            threads: dict[str, int] = self._client.nthreads()
         return max(2 * sum(threads.values()), 1)
+
+    @contextmanager
+    def _answered(self) -> Generator[None]:
+        try:
+            yield
+        except TimeoutError:
+            raise
+        except (OSError, self._distributed.CancelledError) as error:
+            reason = str(error) or type(error).__name__
+            raise WorkersLostError(f"--dask {self._address}: the scheduler is gone ({reason[:120]})") from None
 
     def submit(self, wanted: SearchSlice) -> None:
         """See `Workers`."""
-        self._running[self._client.submit(run_slice, wanted, pure=False)] = wanted
+        with self._answered():
+            self._running[self._client.submit(run_slice, wanted, pure=False)] = wanted
 
     def collect(self, timeout_s: float) -> list[SliceResult]:
         """See `Workers`."""
         if not self._running:
             return []
         try:
-            done: Any = self._distributed.wait(list(self._running), timeout_s, "FIRST_COMPLETED").done
+            with self._answered(), self._client.as_current():
+                done: Any = self._distributed.wait(list(self._running), timeout_s, "FIRST_COMPLETED").done
         except self._distributed.TimeoutError:
             return self._nothing_yet()
         return [result for future in done if (result := self._result(future)) is not None]
@@ -191,19 +218,21 @@ class DaskCluster:
         handed = self._running.pop(future)
         try:
             return future.result()
-        except (self._distributed.KilledWorker, self._distributed.CancelledError) as error:
+        except (self._distributed.KilledWorker, self._distributed.CancelledError, OSError) as error:
             self._deaths += 1
             if self._deaths > MAXIMUM_RESTARTS or self._client.status != "running":
-                raise WorkersLostError(f"--dask {self._address}: {str(error).splitlines()[0][:160]}") from None
+                reason = str(error).partition("\n")[0] or type(error).__name__
+                raise WorkersLostError(f"--dask {self._address}: {reason[:160]}") from None
             self.submit(handed)
             return None
 
     def close(self) -> None:
         """See `Workers`."""
-        for future in self._running:
-            future.cancel()
+        with suppress(OSError, self._distributed.CancelledError):
+            for future in self._running:
+                future.cancel()
+            self._client.close(timeout=CLOSE_TIMEOUT_S)
         self._running.clear()
-        self._client.close()
 
 
 def make_workers(count: int, dask_address: str | None) -> Callable[[], Workers]:

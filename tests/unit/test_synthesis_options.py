@@ -35,6 +35,7 @@ def test_weights_change_and_add_terms_in_the_order_of_terms():
     assert changed[Term.MOBILITY] == 2000.0
     assert changed[Term.STRUCTURAL_ERROR] == 1.0
     assert [term for term in Term if term in changed] == list(changed)
+    assert Term.HARMONIC_CONTENT not in weights("harmonic-content=off")
 
 
 def test_zones_and_free_timing_bring_their_terms():
