@@ -6,19 +6,23 @@ their places. Everything else - bus, drives, limits, guard - stays the template'
 
 import re
 from dataclasses import dataclass
-from math import degrees, pi, radians
+from math import degrees, pi, radians, tau
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import yaml
+from numpy.typing import NDArray
 
-from config.conversion import five_bar
+from config.conversion import dynamics_parameters, five_bar
 from config.loading import parse_config
 from config.schema import GatewayConfig, LinkSection
 from gateway.errors import GatewayError
-from gateway.preparation import PreparedRun, prepare
+from gateway.preparation import PreparedRun, compile_config, prepare
+from mechanism.cam import Cam
 from mechanism.curve import DesiredCurve
 from mechanism.curve_points import curve_csv
+from mechanism.dynamics import mass_matrix_and_bias
 from mechanism.errors import CamLimitError, MechanismError
 from mechanism.five_bar import FiveBar
 from mechanism.synthesis.candidate import Candidate
@@ -31,8 +35,12 @@ _SPEED_MARGIN: Final = 0.995
 _ORDERS: Final = {"velocity": 1, "acceleration": 2, "jerk": 3}
 _TABLE_FAULTS: Final = frozenset({"distance from the curve's spline", "binary table's error"})
 _ROUNDS: Final = 8
+_GAINS_KEPT: Final = 0.05
+"""A change of inertia by less is no reason to change gains."""
+_INERTIA_SAMPLES: Final = 72
 _LINKS: Final = ("p", "q", "r", "s")
 
+Float = NDArray[np.float64]
 Document = dict[str, Any]
 
 
@@ -97,6 +105,7 @@ def write_machine(
     notes: list[str] = []
     config, prepared = _prepared(document, path, remark)
     _settle_home_and_range(document, prepared)
+    notes += _settle_gains(document, prepared, template)
     for _ in range(_ROUNDS):
         config, prepared = _prepared(document, path, remark)
         note = _relieve(document["motion"], prepared.violations, is_speed_fixed)
@@ -172,6 +181,41 @@ def _settle_home_and_range(document: Document, prepared: PreparedRun) -> None:
         return
     low, high = degrees(report.position_minimum.value), degrees(report.position_maximum.value)
     limits["position_deg"] = [round(low - _RANGE_MARGIN_DEG, 1), round(high + _RANGE_MARGIN_DEG, 1)]
+
+
+def _settle_gains(document: Document, prepared: PreparedRun, template: GatewayConfig) -> list[str]:
+    """The emulated controllers' gains grow with the inertia that their axis moves, so that they stay as stiff."""
+    try:
+        before = _mean_inertias(template, compile_config(template).cam)
+        after = _mean_inertias(prepared.config, prepared.cam.cam)
+    except MechanismError:
+        return []
+    notes: list[str] = []
+    for name, factor in zip(template.axis_names, after / before, strict=True):
+        if not (0.0 < factor < float("inf")) or abs(factor - 1.0) < _GAINS_KEPT:
+            continue
+        gains = document["axes"][name]["emulation"]["gains"]
+        for gain, value in gains.items():
+            gains[gain] = round(value * float(factor))
+        notes.append(
+            f"axes.{name}: the emulated drive's gains are {factor:.3g} times the template's, as the axis' inertia is; "
+            "tune a real drive anew"
+        )
+    return notes
+
+
+def _mean_inertias(config: GatewayConfig, cam: Cam) -> Float:
+    """The mass matrix' diagonal (kg m^2; CV axis, servo axis), mean over the cycle."""
+    parameters = dynamics_parameters(config).to_array()
+    theta2 = np.linspace(0.0, tau, _INERTIA_SAMPLES, endpoint=False)
+    theta5 = cam.profile.at_many(theta2)[:, 0]
+    diagonal = np.array(
+        [
+            mass_matrix_and_bias(parameters, first, second, 0.0, 0.0, int(cam.closure))[0:3:2]
+            for first, second in zip(theta2.tolist(), theta5.tolist(), strict=True)
+        ]
+    )
+    return diagonal.mean(axis=0)
 
 
 def _relieve(

@@ -36,9 +36,9 @@ VARIABLE_NAMES: Final = {variable.name.lower(): variable for variable in Variabl
 _USUAL_WEIGHTS: Final = {
     Term.STRUCTURAL_ERROR: 100.0,
     Term.MOBILITY: 1e6,
-    Term.SWEPT_AREA: 0.1,
+    Term.SWEPT_AREA: 0.05,
     Term.HARMONIC_CONTENT: 0.5,
-    Term.TRANSMISSION_ANGLE: 5000.0,
+    Term.TRANSMISSION_ANGLE: 20_000.0,
     Term.SINGULARITY: 1e6,
     Term.PEAK_TORQUE: 3000.0,
 }
