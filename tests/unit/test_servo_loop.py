@@ -153,3 +153,49 @@ def test_output_is_always_a_whole_unit_within_the_converter(
         assert isinstance(servo.output_units, int)
         assert OUTPUT_MINIMUM <= servo.output_units <= OUTPUT_MAXIMUM
         assert torque == servo.output_units * VOLT_PER_UNIT * NM_PER_VOLT
+
+
+def test_a_changed_gain_acts_from_the_next_sample_on() -> None:
+    # Demand 7 a sample, actual 5 a sample: the error grows by 2 a sample, and every other difference is constant.
+    def sample(servo: ServoLoop, n: int, gains: tuple[int, int, int, int, int]) -> int:
+        servo.update(7.0 * n, 5 * n, gains, 0.0, NM_PER_VOLT)
+        return servo.output_units
+
+    # In motion: e = 2, 4, 6, 8; sum 2, 6, 12, 20.
+    servo = started()
+    gains = (256, 0, 0, 512, 512)
+    assert [sample(servo, n, gains) for n in (1, 2)] == [2 - 10 + 14, 4 - 10 + 14]
+    # K_V and K_F together: no bump where the velocity is followed, 2 counts a sample of difference where it is not.
+    assert sample(servo, 3, (256, 0, 0, 1024, 1024)) == 6 + 4 * (7 - 5)
+    # K_P doubled doubles its share at once.
+    assert sample(servo, 4, (512, 0, 0, 1024, 1024)) == 16 + 4 * (7 - 5)
+
+
+def test_the_sum_is_kept_in_counts_so_that_a_changed_integral_gain_changes_its_share_at_once() -> None:
+    servo = started()
+    for _ in range(10):
+        servo.update(3.0, 0, (0, 256, 0, 0, 0), 0.0, NM_PER_VOLT)
+    assert servo.output_units == 30
+    # The eleventh error makes the sum 33, of which twice as much comes out; with K_I at 0 nothing, and the sum waits.
+    servo.update(3.0, 0, (0, 512, 0, 0, 0), 0.0, NM_PER_VOLT)
+    assert servo.output_units == 66
+    servo.update(0.0, 0, (0, 0, 0, 0, 0), 0.0, NM_PER_VOLT)
+    assert servo.output_units == 0
+    servo.update(0.0, 0, (0, 256, 0, 0, 0), 0.0, NM_PER_VOLT)
+    assert servo.output_units == 33
+
+
+def test_the_sum_comes_off_its_limit_at_once_when_the_error_turns() -> None:
+    # K_P 4, K_I 1 units a count: 300 counts give 1200 + sum 300 = 1500, the next 1200 + 600 = 1800, then 1200 + 900 =
+    # 2100, past 2047: the sum stays 600. An error of -100 gives -400 + 500 = 100 in the very next sample; had the sum
+    # gone on for 100 samples to 30 600, the output would have stood at its limit for 300 samples more.
+    servo = started()
+    gains = (1024, 256, 0, 0, 0)
+    outputs: list[int] = []
+    for _ in range(102):
+        servo.update(300.0, 0, gains, 0.0, NM_PER_VOLT)
+        outputs.append(servo.output_units)
+    assert outputs[:3] == [1500, 1800, 2047]
+    assert outputs[-1] == 2047
+    servo.update(-100.0, 0, gains, 0.0, NM_PER_VOLT)
+    assert servo.output_units == 100
