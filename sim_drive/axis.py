@@ -272,7 +272,7 @@ class Axis(MeasuredMotion):
         self._idle_controlword = _NO_CONTROLWORD
         self.set_scaling()
         self.offset = self.settings.initial_offset_counts
-        self.is_powered = False
+        self.power(False)
         self.internal_bits = 0
         self._following_error_since_ns = None
         self._sampled_at_ns = -1
@@ -506,8 +506,9 @@ class Axis(MeasuredMotion):
         self._idle_controlword = _NO_CONTROLWORD
         self._events.append(PowerStateChanged(now_ns, self.node_id, before, state, self.number))
         was_powered = self.is_powered
-        self.is_powered = state is PowerState.OPERATION_ENABLED or (
-            was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE}
+        self.power(
+            state is PowerState.OPERATION_ENABLED
+            or (was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE})
         )
         if not self.is_powered or not was_powered:
             self.demand.hold(float(self.shaft_counts))
@@ -535,7 +536,7 @@ class Axis(MeasuredMotion):
         if self.is_powered:
             ramp = self._option(objects.FAULT_REACTION_OPTION_CODE)
             if ramp is StopRamp.NONE:
-                self.is_powered = False
+                self.power(False)
             elif self._state is PowerState.OPERATION_ENABLED:
                 self._stop(ramp, now_ns)
         self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)

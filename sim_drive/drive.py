@@ -179,7 +179,8 @@ class Drive:
         self.is_switched_off = False
         """Without supply, by ``switch_off``."""
         self._next_wake_ns: int | None = 0
-        self._is_wake_stale = False
+        self.is_wake_stale = False
+        """Whether ``next_wake_ns`` has to look anew."""
         apply_quirks(self)
 
     def _set_identity(self) -> None:
@@ -196,6 +197,10 @@ class Drive:
         """COB-IDs that the drive listens to."""
         return {*self._handlers, *self._request_handlers}
 
+    def handler_of(self, cob_id: int) -> FrameHandler | None:
+        """What ``receive`` does with a data frame of this COB-ID, until ``subscriptions_changed``."""
+        return self._handlers.get(cob_id)
+
     def receive(self, frame: Frame, now_ns: int) -> None:
         """Take a frame of another node; what is not for this drive passes by."""
         handler = self._handlers.get(frame.cob_id)
@@ -207,19 +212,19 @@ class Drive:
     def _take_request(self, cob_id: int, now_ns: int) -> None:
         handler = self._request_handlers.get(cob_id)
         if handler is not None:
-            self._is_wake_stale = True
+            self.is_wake_stale = True
             handler(now_ns)
 
     def next_wake_ns(self) -> int | None:
         """When heartbeats, SDO or PDO timers, or the boot-up want ``wake``."""
-        if self._is_wake_stale:
-            self._is_wake_stale = False
+        if self.is_wake_stale:
+            self.is_wake_stale = False
             self._next_wake_ns = self._find_next_wake()
         return self._next_wake_ns
 
     def wake(self, now_ns: int) -> None:
         """Do what is due."""
-        self._is_wake_stale = True
+        self.is_wake_stale = True
         if self.is_switched_off:
             return
         if self._boot_due_ns is not None:
@@ -341,7 +346,7 @@ class Drive:
         self._enter(NmtState.BOOT_UP, now_ns)
         self._reset(True, now_ns)
         self.outbox.clear()
-        self._is_wake_stale = True
+        self.is_wake_stale = True
 
     def switch_on(self, now_ns: int) -> None:
         """Give the supply back: the drive boots."""
@@ -351,7 +356,7 @@ class Drive:
                 axis.is_switched_off = False
             self._is_powered_on = False
             self._boot_due_ns = now_ns
-            self._is_wake_stale = True
+            self.is_wake_stale = True
 
     # -- NMT -----------------------------------------------------------------------------------------------------
 
@@ -359,7 +364,7 @@ class Drive:
         command = parse_command(data, self.node_id)
         if command is None:
             return
-        self._is_wake_stale = True
+        self.is_wake_stale = True
         is_reset = command in {NmtCommand.RESET_NODE, NmtCommand.RESET_COMMUNICATION}
         state = next_state(command)
         if state is self.nmt_state:
@@ -477,12 +482,12 @@ class Drive:
         self._handlers = handlers
         self._request_handlers = self._pdos.request_handlers()
         self._request_handlers[HEARTBEAT_BASE + self.node_id] = self._on_guard_request
-        self._is_wake_stale = True
+        self.is_wake_stale = True
         self.subscriptions_changed = True
 
     def _heartbeat_handler(self, node_id: int) -> FrameHandler:
         def handle(data: bytes, now_ns: int) -> None:
-            self._is_wake_stale = True
+            self.is_wake_stale = True
             self._consumer.receive(node_id, data, now_ns)
 
         return handle
@@ -495,7 +500,7 @@ class Drive:
             self._time.receive(data, now_ns)
 
     def _on_lss(self, data: bytes, now_ns: int) -> None:
-        self._is_wake_stale = True
+        self.is_wake_stale = True
         self._lss.receive(data, now_ns)
 
     def _on_lss_waiting(self, now_ns: int) -> None:
@@ -507,11 +512,11 @@ class Drive:
         self.events.append(BitTimingActivated(now_ns, self.node_id, bit_timing, delay_ms))
 
     def _expect_wake(self) -> None:
-        self._is_wake_stale = True
+        self.is_wake_stale = True
 
     def _on_sdo(self, data: bytes, now_ns: int) -> None:
         if self.nmt_state in {NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL}:
-            self._is_wake_stale = True
+            self.is_wake_stale = True
             if data and data[0] >> 5 in _BLOCK_COMMANDS and Quirk.NO_BLOCK_TRANSFER in self.settings.quirks:
                 # A command that no server knows, so that this one answers as to any other.
                 data = bytes((_UNKNOWN_COMMAND, *data[1:]))

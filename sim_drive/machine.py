@@ -30,6 +30,8 @@ _MAX_WAKES_PER_INSTANT: Final = 16
 _MAX_CROSS_ROUNDS: Final = 8
 
 
+FrameHandler = Callable[[bytes, int], None]
+"""Takes the data of a frame, and the time in ns."""
 Latch = Callable[[int], tuple[int, float, int]]
 """Actual values at an instant (ns): position in counts, velocity in counts/s, torque in per mille of rated torque."""
 
@@ -48,6 +50,11 @@ class DriveAxis(Protocol):
     @property
     def velocity_offset(self) -> float:
         """Counts/s that the controller's velocity feed-forward is to have beside the demand's own."""
+        ...
+
+    @property
+    def torque_demand(self) -> float | None:
+        """Not None where ``torque_demand_Nm`` is."""
         ...
 
     @property
@@ -70,7 +77,12 @@ class MachineDrive(Protocol):
     """What the machine needs of a drive, a node of one or more axes; `sim_drive.drive` has the real one."""
 
     subscriptions_changed: bool
-    """Set by the drive when `cob_ids` has changed, reset by the machine."""
+    """Set by the drive when `cob_ids` or `handler_of` has changed, reset by the machine."""
+
+    @property
+    def is_wake_stale(self) -> bool:
+        """Whether `next_wake_ns` may give something else than when it was asked last."""
+        ...
 
     @property
     def axes(self) -> Sequence[DriveAxis]: ...
@@ -85,6 +97,10 @@ class MachineDrive(Protocol):
         ...
 
     def cob_ids(self) -> set[int]: ...
+    def handler_of(self, cob_id: int) -> FrameHandler | None:
+        """What ``receive`` would do with a data frame of this COB-ID, without the frame around it; None: ask that."""
+        ...
+
     def receive(self, frame: Frame, now_ns: int) -> None: ...
     def next_wake_ns(self) -> int | None: ...
     def wake(self, now_ns: int) -> None: ...
@@ -199,6 +215,7 @@ class _Motor:
         "drive_axis",
         "eccentricity",
         "index",
+        "is_plain",
         "is_powered",
         "noise",
         "permille_per_Nm",
@@ -223,6 +240,8 @@ class _Motor:
         self.delayed_torque = 0.0
         """Torque command of the last servo tick, with an output delay."""
         self.tap: AxisTap | None = None
+        self.is_plain = not self.eccentricity
+        """Whether the resolver shows no more than the angle and its noise."""
 
     def quantise(self, angle_rad: float) -> int:
         """What the resolver shows at this angle."""
@@ -270,6 +289,10 @@ class _Station:
                 self.drive.receive(heard, now_ns)
 
 
+_Route = tuple[tuple[_Station, FrameHandler | None], ...]
+"""The drives that listen to a COB-ID, each with what may be called in place of its ``receive``."""
+
+
 class EmulatedMachine:
     """Drives and plant as one core (`drivers.node.Node`); the drives' axes move those of the plant in their order.
 
@@ -289,6 +312,7 @@ class EmulatedMachine:
 
     __slots__ = (
         "_brakes",
+        "_drives_due_ns",
         "_due_ns",
         "_events",
         "_frames",
@@ -349,9 +373,11 @@ class EmulatedMachine:
         self._next_tick_ns = start_ns + TWO_SERVO_PERIODS_NS // 2
         self._due_ns = self._next_tick_ns
         """The next servo tick or the earliest wake of a drive."""
+        self._drives_due_ns = _NEVER
+        """The earliest wake of a drive."""
         self._frames: list[Frame] = []
         self._events: list[Event] = []
-        self._routes: dict[int, tuple[_Station, ...]] = {}
+        self._routes: dict[int, _Route] = {}
         for motor in self._motors:
             motor.counts = motor.quantise(plant.angle(motor.index))
             motor.drive_axis.measure_by(self._latch_of(motor))
@@ -375,6 +401,8 @@ class EmulatedMachine:
         station.receive = station.receive_through_tap
         for motor, axis_tap in zip(station.motors, tap.axes, strict=True):
             motor.tap = axis_tap
+            motor.is_plain = False
+        self._read_subscriptions()
 
     def deliver(self, place: int, frame: Frame, now_ns: int) -> None:
         """Let a drive hear a frame that its tap has held back."""
@@ -403,12 +431,19 @@ class EmulatedMachine:
         listeners = self._routes.get(frame.cob_id)
         if listeners is None:
             return
-        for station in listeners:
-            station.receive(frame, now_ns)
-            wake_ns = station.next_wake_ns()
-            if wake_ns != station.wake_ns:
-                self._set_wake(station, wake_ns)
-        self._listen(now_ns)
+        is_quiet = True
+        for station, handler in listeners:
+            if handler is None or frame.is_remote:
+                station.receive(frame, now_ns)
+            else:
+                handler(frame.data, now_ns)
+            drive = station.drive
+            if drive.is_wake_stale:
+                self._ask_wake(station)
+            if station.outbox or station.events or drive.subscriptions_changed:
+                is_quiet = False
+        if not is_quiet:
+            self._exchange(now_ns)
 
     def next_wake_ns(self) -> int | None:
         """The next servo tick or the next wake of a drive; never None, for the servo ticks never end."""
@@ -440,7 +475,9 @@ class EmulatedMachine:
         return events
 
     def _ask_wake(self, station: _Station) -> None:
-        self._set_wake(station, station.next_wake_ns())
+        wake_ns = station.next_wake_ns()
+        if wake_ns != station.wake_ns:
+            self._set_wake(station, wake_ns)
 
     def _set_wake(self, station: _Station, wake_ns: int | None) -> None:
         station.wake_ns = wake_ns
@@ -448,14 +485,15 @@ class EmulatedMachine:
         self._find_due()
 
     def _find_due(self) -> None:
-        self._due_ns = min(self._next_tick_ns, *[station.due_ns for station in self._stations])
+        self._drives_due_ns = min(station.due_ns for station in self._stations)
+        self._due_ns = min(self._next_tick_ns, self._drives_due_ns)
 
     def _wake_drive(self, station: _Station, due_ns: int) -> None:
         # A wake asked for in the past (a servo tick may do that) is due now: no drive sees time run backwards.
         at_ns = due_ns if due_ns > self._tick_ns else self._tick_ns
         for _ in range(_MAX_WAKES_PER_INSTANT):
             station.drive.wake(at_ns)
-            self._ask_wake(station)
+            self._set_wake(station, station.next_wake_ns())
             if station.due_ns > at_ns:
                 break
         else:
@@ -468,20 +506,24 @@ class EmulatedMachine:
         plant.advance(self._torques, self._brakes)
         self._tick += 1
         self._tick_ns = now_ns
-        self._next_tick_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
-        self._find_due()
+        self._next_tick_ns = next_ns = self._start_ns + (self._tick + 1) * TWO_SERVO_PERIODS_NS // 2
+        self._due_ns = next_ns if next_ns < self._drives_due_ns else self._drives_due_ns
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
+        is_quiet = True
         for station in self._stations:
             for motor in station.motors:
                 self._run_servo(motor, now_ns)
             station.after_servo_tick(now_ns)
-            wake_ns = station.next_wake_ns()
-            if wake_ns != station.wake_ns:
-                self._set_wake(station, wake_ns)
+            drive = station.drive
+            if drive.is_wake_stale:
+                self._ask_wake(station)
+            if station.outbox or station.events or drive.subscriptions_changed:
+                is_quiet = False
         if self.records.maxlen:
             self._record(now_ns)
-        self._listen(now_ns)
+        if not is_quiet:
+            self._exchange(now_ns)
 
     def _run_servo(self, motor: _Motor, now_ns: int) -> None:
         """Show an axis its resolver, and let its controller make the torque for the coming servo period."""
@@ -490,8 +532,10 @@ class EmulatedMachine:
         axis = motor.axis
         if axis.resolver_noise_counts > 0.0:
             motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
-        counts = motor.quantise(self.plant.angle(index))
+        angle = self.plant.angle(index)
         tap = motor.tap
+        plain = angle * motor.counts_per_rad + motor.noise + 0.5
+        counts = floor(plain) if motor.is_plain else motor.quantise(angle)
         motor.velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
         motor.counts = counts
         drive_axis.on_tick(now_ns, counts)
@@ -503,7 +547,7 @@ class EmulatedMachine:
         demand = drive_axis.position_demand_counts
         if not motor.is_powered:
             self._power_on(motor, demand, now_ns)
-        torque = drive_axis.torque_demand_Nm
+        torque = None if drive_axis.torque_demand is None else drive_axis.torque_demand_Nm
         if torque is None:
             torque = motor.servo.update(
                 demand,
@@ -530,13 +574,6 @@ class EmulatedMachine:
             # Neither a fault reset nor switching the drive off and on mends a torn linkage.
             motor.drive_axis.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
-    def _listen(self, now_ns: int) -> None:
-        """Let the drives hear each other if any of them has something to say."""
-        for station in self._stations:
-            if station.outbox or station.events or station.drive.subscriptions_changed:
-                self._exchange(now_ns)
-                return
-
     def _exchange(self, now_ns: int) -> None:
         """Collect what the drives have sent and noticed, and let them hear each other."""
         for _ in range(_MAX_CROSS_ROUNDS):
@@ -562,17 +599,18 @@ class EmulatedMachine:
                 return
 
     def _tell_others(self, sender: _Station, frame: Frame, now_ns: int) -> None:
-        for station in self._routes[frame.cob_id]:
+        for station, _ in self._routes[frame.cob_id]:
             if station is not sender:
                 station.receive(frame, now_ns)
                 self._ask_wake(station)
 
     def _read_subscriptions(self) -> None:
-        routes: dict[int, tuple[_Station, ...]] = {}
+        routes: dict[int, _Route] = {}
         for station in self._stations:
             station.drive.subscriptions_changed = False
             for cob_id in sorted(station.drive.cob_ids()):
-                routes[cob_id] = (*routes.get(cob_id, ()), station)
+                handler = None if station.tap is not None else station.drive.handler_of(cob_id)
+                routes[cob_id] = (*routes.get(cob_id, ()), (station, handler))
         self._routes = routes
 
     def _latch_of(self, motor: _Motor) -> Latch:
@@ -586,8 +624,11 @@ class EmulatedMachine:
                 offset_s = 0.0
             elif offset_s > SERVO_PERIOD_S:
                 offset_s = SERVO_PERIOD_S
+            radians = angle(index, offset_s)
             return (
-                motor.quantise(angle(index, offset_s)),
+                floor(radians * motor.counts_per_rad + motor.noise + 0.5)
+                if motor.is_plain
+                else motor.quantise(radians),
                 motor.velocity,
                 floor(torque(index) * motor.permille_per_Nm + 0.5),
             )

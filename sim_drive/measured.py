@@ -7,6 +7,7 @@ from typing import Final
 
 from drivers import objects
 from drivers.object_dictionary import Value
+from drivers.sdo import AbortCode
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.motion import Motion, wrap_int32
 from sim_drive.settings import DriveSettings
@@ -38,6 +39,7 @@ class MeasuredMotion(Motion):
         "_sampled_at_ns",
         "_torque_actual",
         "_velocity_actual",
+        "is_brake_released",
         "is_powered",
     )
 
@@ -55,7 +57,11 @@ class MeasuredMotion(Motion):
         self._output_mask = entry(objects.DIGITAL_OUTPUTS, 2)
         self._sampled_at_ns = -1
         self.is_powered = False
-        """Whether the amplifier may put torque on the motor."""
+        """Whether the amplifier may put torque on the motor; set by ``power``."""
+        self.is_brake_released = False
+        """Whether the holding brake is open: while there is torque to hold the axis, unless 60FEh says otherwise."""
+        self._outputs.on_write = self._on_outputs
+        self._output_mask.on_write = self._on_output_mask
         self._digital_inputs.on_read = self._read_inputs
         entry(objects.VELOCITY_DEMAND_VALUE).on_read = self._read_velocity_demand
         entry(objects.TORQUE_DEMAND).on_read = self._read_torque_demand
@@ -75,12 +81,21 @@ class MeasuredMotion(Motion):
         """The outputs that are on: 60FEh:01 where the mask 60FEh:02 lets it act."""
         return self._outputs.value & self._output_mask.value
 
-    @property
-    def is_brake_released(self) -> bool:
-        """Whether the holding brake is open: while there is torque to hold the axis, unless 60FEh says otherwise."""
-        if self._output_mask.value & _SET_BRAKE:
-            return not self._outputs.value & _SET_BRAKE
-        return self.is_powered
+    def power(self, is_powered: bool) -> None:
+        """Switch the amplifier on or off, and the holding brake with it."""
+        self.is_powered = is_powered
+        self._move_brake(self._outputs.value, self._output_mask.value)
+
+    def _move_brake(self, outputs: int, mask: int) -> None:
+        self.is_brake_released = not outputs & _SET_BRAKE if mask & _SET_BRAKE else self.is_powered
+
+    def _on_outputs(self, value: int, now_ns: int) -> AbortCode | None:
+        self._move_brake(value, self._output_mask.value)
+        return None
+
+    def _on_output_mask(self, value: int, now_ns: int) -> AbortCode | None:
+        self._move_brake(self._outputs.value, value)
+        return None
 
     # -- sampling ------------------------------------------------------------------------------------------------
 

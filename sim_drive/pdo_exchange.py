@@ -190,8 +190,17 @@ class PdoExchange:
         if rpdo.is_synchronous and self._acts_on_receipt:
             return self._hasty_rpdo_handler(rpdo)
 
+        is_synchronous = rpdo.is_synchronous
+        length = rpdo.length
+        emergency = self._emergency
+
         def handle(data: bytes, now_ns: int) -> None:
-            if self.is_operational:
+            if not self.is_operational:
+                return
+            if is_synchronous and len(data) == length and not emergency.has_errors:
+                # As ``receive`` would: nothing but this is done for most frames there are.
+                rpdo.pending = data
+            else:
                 receive(data, now_ns)
 
         return handle

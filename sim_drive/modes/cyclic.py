@@ -58,7 +58,10 @@ class CyclicPosition(OperationMode):
             motion = self.motion
             if not motion.is_halted:
                 self._follow(self._new_target, now_ns, True)
-                motion.expect_next(now_ns)
+                if motion.is_guarded:
+                    motion.set_point_at_ns = now_ns
+                else:
+                    motion.expect_next(now_ns)
 
     def _on_target(self, value: int, now_ns: int) -> AbortCode | None:
         if self.is_active:

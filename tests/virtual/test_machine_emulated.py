@@ -51,6 +51,7 @@ class FakeDrive:
         self.position_demand_counts = 0.0
         self.torque_offset_Nm = 0.0
         self.velocity_offset = 0.0
+        self.is_wake_stale = True
         self.torque_demand_Nm: float | None = None
         self.torque_limit_Nm = 4.5
         self.negative_torque_limit_Nm = 4.5
@@ -70,6 +71,13 @@ class FakeDrive:
 
     def measure_by(self, latch: Latch) -> None:
         self.latch = latch
+
+    @property
+    def torque_demand(self) -> float | None:
+        return self.torque_demand_Nm
+
+    def handler_of(self, cob_id: int) -> None:
+        return None
 
     def cob_ids(self) -> set[int]:
         return self.listens
