@@ -94,6 +94,10 @@ def test_an_interrupted_search_comes_to_the_same(method: Method, steps: int) -> 
         calls.append(population.shape[0])
         return evaluate(task, population)
 
+    # Twice, so that what is saved after going on is whole as well.
+    again = search(task, method, 11, BUDGET, state=state, evaluate_population=counted)
+    state = next(again).state
+    again.close()  # type: ignore[attr-defined]
     resumed = last(search(task, method, 11, BUDGET, state=state, evaluate_population=counted))
     assert_same(whole, resumed)
     # And it is not simply done again.
