@@ -1,27 +1,27 @@
-"""Kernels: the paper's four terms of a population, eqs (1) to (4)."""
+"""Kernels: the paper's four terms, eqs (1) to (4), of one tracked mechanism and of a whole population."""
 
 from math import inf, sqrt
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mechanism.jit import kernel
+from mechanism.synthesis.lane_kernels import FIXED_ROWS, LANE_WIDTH, LANES, lane_terms, sum_up, track_block
 from mechanism.synthesis.tracking_kernels import (
+    DEGREES_PER_RADIAN,
     DISPLACEMENT,
     ERROR,
     IMMOBILE,
+    MM_PER_M,
     assemble_both,
     cheapest_cycle,
     choose,
+    harmonic_cost,
     step_costs,
     whole_blocks,
 )
 
 Float = NDArray[np.float64]
-
-MM_PER_M: Final = 1e3
-DEGREES_PER_RADIAN: Final = 57.29577951308232
 
 
 @kernel
@@ -59,11 +59,7 @@ def paper_terms(
     for order in range(size // 2):
         a = coefficients[2 * order]
         b = coefficients[2 * order + 1]
-        amplitude = sqrt(a * a + b * b)
-        power = amplitude
-        for _ in range(order + 1):
-            power *= amplitude
-        harmonic += power
+        harmonic += harmonic_cost(a, b, order + 1)
     error *= MM_PER_M
     return error * error, immobile * immobile * immobile, s * sqrt(squares) * MM_PER_M * DEGREES_PER_RADIAN, harmonic
 
@@ -82,12 +78,21 @@ def weigh(terms: Float, columns: NDArray[np.int64], weights: Float, values: Floa
 def evaluate_paper_terms(
     population: Float, rows: Float, count: int, fourier: Float, minimum_sine: float, terms: Float
 ) -> None:
-    """Fill ``terms`` (m, 4) for a population (m, 8); ``rows`` has the task's points (`Points.rows`)."""
-    choices = np.zeros(whole_blocks(count), dtype=np.int64)
-    coefficients = np.empty(fourier.shape[1])
-    for j in range(population.shape[0]):
-        variables = population[j]
-        track(rows, choices, count, variables, minimum_sine)
-        terms[j, 0], terms[j, 1], terms[j, 2], terms[j, 3] = paper_terms(
-            rows, count, variables[3], fourier, coefficients
-        )
+    """Fill ``terms`` (m, 4) for a population (m, 8); ``rows`` has the task's points (`objective.prepare`)."""
+    size = fourier.shape[1]
+    w = np.zeros((FIXED_ROWS + size) * LANE_WIDTH)
+    lefts = np.empty(count * LANES)
+    rights = np.empty(count * LANES)
+    bits = np.empty(count * LANES)
+    for start in range(0, population.shape[0], LANES):
+        used = min(LANES, population.shape[0] - start)
+        lanes = whole_blocks(used)
+        # What fills up the last lanes is the last mechanism again.
+        for k in range(lanes):
+            row = start + min(k, used - 1)
+            for v in range(8):
+                w[v * LANE_WIDTH + k] = population[row, v]
+        track_block(w, lanes, rows, count, minimum_sine, lefts, rights, bits)
+        sum_up(w, lanes, count, lefts, fourier)
+        for k in range(used):
+            terms[start + k, 0], terms[start + k, 1], terms[start + k, 2], terms[start + k, 3] = lane_terms(w, k, size)

@@ -55,12 +55,15 @@ ROWS: Final = 26
 BLOCK: Final = 8
 """Loops without carried values run over whole blocks; what stands after the last point is worked on and never read."""
 
+MM_PER_M: Final = 1e3
+DEGREES_PER_RADIAN: Final = 57.29577951308232
+
 _HALF_PI: Final = 0.5 * pi
 _QUARTER_PI: Final = 0.25 * pi
 _PER_TURN: Final = 1.0 / tau
 _TAN_PI_8: Final = 0.41421356237309503
 _FAULT_COST: Final = 4.0 * pi * pi
-_REACH_ROUNDING: Final = 1.0 + 1e-12
+REACH_ROUNDING: Final = 1.0 + 1e-12
 
 
 @kernel
@@ -137,7 +140,7 @@ def assemble_both(rows: Float, count: int, variables: Float) -> None:
         reach = sqrt(squared)
         per_reach = 1.0 / (reach if reach > 0.0 else 1e-300)
         cosine = (squares + squared) * half_per_s * per_reach
-        can = abs(cosine) <= _REACH_ROUNDING
+        can = abs(cosine) <= REACH_ROUNDING
         cosine = cosine if can else 1.0
         cosine = min(max(cosine, -1.0), 1.0)
         sine = sqrt(1.0 - cosine * cosine)
@@ -161,7 +164,8 @@ def assemble_both(rows: Float, count: int, variables: Float) -> None:
 
 
 @kernel
-def _step_cost(step: float, sine_before: float, sine: float, minimum_sine: float) -> float:
+def step_cost(step: float, sine_before: float, sine: float, minimum_sine: float) -> float:
+    """What a step of theta5 (rad) costs between two positions with these sines of theta3 - theta4, rad^2."""
     # A fault costs more than the longest possible step, so that steps only decide between equally sound sequences.
     cost = step * step
     cost = cost + _FAULT_COST if (sine_before > 0.0) != (sine > 0.0) else cost
@@ -178,10 +182,10 @@ def _step_costs_at(rows: Float, before: int, i: int, minimum_sine: float) -> Non
     right = rows[RIGHT + i]
     left_sine = rows[LEFT_SINE + i]
     right_sine = rows[RIGHT_SINE + i]
-    rows[LEFT_LEFT + i] = _step_cost(wrapped(left - left_before), left_sine_before, left_sine, minimum_sine)
-    rows[RIGHT_LEFT + i] = _step_cost(wrapped(left - right_before), right_sine_before, left_sine, minimum_sine)
-    rows[LEFT_RIGHT + i] = _step_cost(wrapped(right - left_before), left_sine_before, right_sine, minimum_sine)
-    rows[RIGHT_RIGHT + i] = _step_cost(wrapped(right - right_before), right_sine_before, right_sine, minimum_sine)
+    rows[LEFT_LEFT + i] = step_cost(wrapped(left - left_before), left_sine_before, left_sine, minimum_sine)
+    rows[RIGHT_LEFT + i] = step_cost(wrapped(left - right_before), right_sine_before, left_sine, minimum_sine)
+    rows[LEFT_RIGHT + i] = step_cost(wrapped(right - left_before), left_sine_before, right_sine, minimum_sine)
+    rows[RIGHT_RIGHT + i] = step_cost(wrapped(right - right_before), right_sine_before, right_sine, minimum_sine)
 
 
 @kernel
@@ -253,3 +257,13 @@ def choose(rows: Float, count: int, choices: NDArray[np.int64]) -> None:
     for i in range(1, count):
         displacement += rows[STEP + i]
         rows[DISPLACEMENT + i] = displacement
+
+
+@kernel
+def harmonic_cost(a: float, b: float, order: int) -> float:
+    """What the harmonic of an order (1 and up) with these coefficients adds to eq (2): its amplitude^(order + 1)."""
+    amplitude = sqrt(a * a + b * b)
+    power = amplitude
+    for _ in range(order):
+        power *= amplitude
+    return power

@@ -157,6 +157,15 @@ def test_tracking_is_that_of_the_cam(points: int) -> None:
         np.testing.assert_allclose(np.abs((difference + pi) % tau - pi), 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize("count", [1, 7, 8, 64, 65, 130])
+def test_side_by_side_as_one_by_one(count: int) -> None:
+    """Blocks of mechanisms side by side give to the last bit what the kernels of single ones give."""
+    task = replace(paper_task(), bounds=Bounds.for_curve(paper_curve().x, paper_curve().y))
+    rows = random_rows(task, count, count)
+    one_by_one = evaluate(replace(task, terms=(*PAPER_TERMS, WeightedTerm(Term.SINGULARITY))), rows)
+    np.testing.assert_array_equal(evaluate(task, rows), one_by_one[:, :4])
+
+
 def test_result_does_not_depend_on_the_other_rows() -> None:
     task = replace(paper_task(), terms=ALL)
     rows = random_rows(task, 20)
