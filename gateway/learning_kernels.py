@@ -64,7 +64,9 @@ UPDATES: Final = 7
 """Bins that have been learned."""
 INTEGRAL: Final = 8
 """Integral of the error, rad s (2 numbers); it forgets within a radian of the master's turn."""
-STATES: Final = 10
+MEAN: Final = 10
+"""Running mean of the error over a revolution, rad (2 numbers)."""
+STATES: Final = 12
 
 # The settings: constants of a run.
 GAIN: Final = 0
@@ -173,10 +175,14 @@ def _close_bin(memory: Float, work: Float, state: Float, settings: Float, last: 
         error = work[SUM + axis, last] / state[COUNT]
         for step in range(passed):
             b = (last + step) % bins
+            # A controller that integrates has the mean of the error at 0, whatever the mean of the correction is: the
+            # rest that resolution leaves of it says nothing, and would let the correction drift.
+            state[MEAN + axis] += (error - state[MEAN + axis]) / bins
+            swing = error - state[MEAN + axis] if settings[INTEGRATING + axis] > 0.0 else error
             # Half of the bin before its middle, half of it after.
-            state[INTEGRAL + axis] = kept * state[INTEGRAL + axis] + 0.5 * bin_s * error
-            missing = settings[PROPORTIONAL + axis] * error + settings[INTEGRATING + axis] * state[INTEGRAL + axis]
-            state[INTEGRAL + axis] += 0.5 * bin_s * error
+            state[INTEGRAL + axis] = kept * state[INTEGRAL + axis] + 0.5 * bin_s * swing
+            missing = settings[PROPORTIONAL + axis] * swing + settings[INTEGRATING + axis] * state[INTEGRAL + axis]
+            state[INTEGRAL + axis] += 0.5 * bin_s * swing
             work[ERROR + axis, b] = error
             work[WANTED + axis, b] = memory[axis, b] + settings[GAIN] * missing
 
