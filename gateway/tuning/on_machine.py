@@ -162,6 +162,8 @@ def tune_on_machine(
 def trial_config(config: GatewayConfig, error_limits: tuple[int, int] | None = None) -> GatewayConfig:
     """The configuration for the runs: reduced following errors, upon which the machine stops on the cam.
 
+    Torque offsets are left out: they would hide what the gains are worth.
+
     ``error_limits``: counts of (master, slave); None: a share of the configured ones.
     """
     document = config.model_dump(mode="json")
@@ -169,6 +171,8 @@ def trial_config(config: GatewayConfig, error_limits: tuple[int, int] | None = N
         limits = document["axes"][name]["limits"]
         own = max(1, round(ERROR_LIMIT_SHARE * limits["following_error_counts"]))
         limits["guarded_error_counts"] = own if error_limits is None else error_limits[number]
+    for section in ("feed_forward", "learning"):
+        document[section]["enabled"] = False
     document["guard"]["following_error"].update(reaction=Reaction.CONTROLLED_STOP.value)
     return parse_config(yaml.safe_dump(document, sort_keys=False), config.path)
 

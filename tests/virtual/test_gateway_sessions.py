@@ -21,6 +21,8 @@ from sim_drive.assembly import build_machine
 
 PAPER = load_config("paper")
 SECOND = 1_000_000_000
+WITHOUT_FEED_FORWARD = ("feed_forward: {enabled: true}", "feed_forward: {enabled: false}")
+"""With it, hardly any error is left that a guard could see."""
 CV_TPDO, SERVO_TPDO, SERVO_HEARTBEAT = 0x181, 0x182, 0x702
 
 
@@ -313,7 +315,7 @@ def test_a_lost_heartbeat_makes_a_quick_stop():
 
 
 def test_a_following_error_beyond_its_limit_makes_a_quick_stop():
-    tight = changed(("following_error_counts: 300", "following_error_counts: 12"))
+    tight = changed(("following_error_counts: 300", "following_error_counts: 12"), WITHOUT_FEED_FORWARD)
     session = Session(tight, PAPER, cycles=5).to_end()
     assert session.core.stopped_by in {StopReason.FOLLOWING_ERROR, StopReason.EMERGENCY}
     session.assert_safe()
@@ -322,6 +324,7 @@ def test_a_following_error_beyond_its_limit_makes_a_quick_stop():
 def test_a_warning_only_warns():
     lenient = changed(
         ("following_error_counts: 300", "following_error_counts: 12"),
+        WITHOUT_FEED_FORWARD,
         ("persistence_cycles: 1, reaction: quick_stop", "persistence_cycles: 1, reaction: warn"),
         ("emergency: {reaction: quick_stop}", "emergency: {reaction: warn}"),
         ("drive_fault: {reaction: quick_stop}", "drive_fault: {reaction: warn}"),

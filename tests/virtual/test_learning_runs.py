@@ -47,7 +47,7 @@ def test_the_whole_chain_learns_what_the_fast_loop_learns(cam):
     config = configured(HEAVY, LEARNING)
     whole = WholeRun(config, 14).cycles(14)
     fast = FastRun(config, profile=cam).cycles(14)
-    assert whole.worst(0, 1)[1] > 0.8
+    assert whole.worst(0, 1)[1] > 1.3 * whole.worst(9)[1]
     assert_reached(whole.worst(9))
     assert whole.rms[:, 1] == pytest.approx(fast.rms[:, 1], abs=0.15)
 
