@@ -52,6 +52,11 @@ class Camming(OperationMode):
         self._is_engaged = False
         self._slots.is_running = False
 
+    def halt(self, now_ns: int) -> None:
+        """Disengage, and come to rest; after the halt the cam is engaged anew, if it does not make the axis jump."""
+        self._is_engaged = False
+        self.motion.halt(now_ns)
+
     def on_sync(self, now_ns: int) -> None:
         """Let the master position that a synchronous RPDO has brought act."""
         if self._is_new:
@@ -69,6 +74,8 @@ class Camming(OperationMode):
 
     def _follow(self, master: int, now_ns: int) -> None:
         motion = self.motion
+        if motion.is_halted:
+            return
         table = self._slots.selected_table
         if table is None:
             motion.trip(EmergencyCode.CAM_NOT_VALID, _DRIVE_ERROR, now_ns)

@@ -37,8 +37,8 @@ class CyclicPosition(OperationMode):
 
     @property
     def status_bits(self) -> int:
-        """Bit 12: the drive follows the command value."""
-        return _FOLLOWS if self.is_active else 0
+        """Bit 12: the drive follows the command value, which it does not in a halt."""
+        return _FOLLOWS if self.is_active and not self.motion.is_halted else 0
 
     def enter(self, now_ns: int) -> None:
         """Hold until the first new target.
@@ -125,8 +125,8 @@ class CyclicVelocity(OperationMode):
 
     @property
     def status_bits(self) -> int:
-        """Bit 12: the drive follows the command value."""
-        return _FOLLOWS if self.is_active else 0
+        """Bit 12: the drive follows the command value, which it does not in a halt."""
+        return _FOLLOWS if self.is_active and not self.motion.is_halted else 0
 
     def enter(self, now_ns: int) -> None:
         """Come to rest, and hold until the first new target."""
@@ -197,8 +197,8 @@ class CyclicTorque(OperationMode):
 
     @property
     def status_bits(self) -> int:
-        """Bit 12: the drive follows the command value."""
-        return _FOLLOWS if self.is_active else 0
+        """Bit 12: the drive follows the command value, which it does not in a halt."""
+        return _FOLLOWS if self.is_active and not self.motion.is_halted else 0
 
     def enter(self, now_ns: int) -> None:
         """Come to rest, and hold until the first new target."""
