@@ -83,8 +83,8 @@ def render_svg(draw: Draw, title: str, stem: str) -> str:
         figure.savefig(stream, format="svg", transparent=True, metadata=nothing)
     svg = stream.getvalue()
     svg = svg[svg.index("<svg") :]
-    # A hundredth of a point is finer than any screen, and halves the page.
-    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
+    # A hundredth of a point is finer than any screen, and halves the page; what stands between the tags is for reading.
+    svg = re.sub(r"<[^>]*>", lambda tag: re.sub(r"(\d\.\d\d)\d+", r"\1", tag[0]), svg)
     for name, marker in _PAGE_COLOURS.items():
         svg = svg.replace(marker, f"var(--{name})")
     # One page holds several figures: their ids must differ.

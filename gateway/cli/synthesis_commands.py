@@ -235,8 +235,8 @@ def _show(outcome: "SynthesisOutcome") -> None:
     bar, report = outcome.candidate.five_bar(), outcome.machine.prepared.cam.report
     table = Table(title=f"{outcome.machine.path}: terms of the mechanism", title_justify="left")
     table.add_column("")
-    for name in ("value", "weight", "weighted"):
-        table.add_column(name, justify="right")
+    for name in ("value", "unit", "weight", "weighted"):
+        table.add_column(name, justify="left" if name == "unit" else "right")
     for row in term_rows(outcome.candidate):
         table.add_row(*row)
     console.print(table)

@@ -18,6 +18,7 @@ from gateway.synthesis.run_search import SearchStatus
 from gateway.synthesis.search_slice import Found
 from gateway.synthesis.task_options import slug
 from mechanism.synthesis.candidate import Candidate
+from mechanism.synthesis.task import Term
 
 Float = NDArray[np.floating[Any]]
 
@@ -93,8 +94,7 @@ def render_synthesis_page(data: SynthesisData, machine: MachineFiles) -> str:
         for plot in synthesis_plots(data)
     }
     status, settings = data.status, data.status.settings
-    complaints = [*(str(error) for error in machine.violations)]
-    notes = "".join(f"<p>{escape(text)}</p>" for text in (*complaints, *machine.notes))
+    notes = "".join(f"<p>{escape(text)}</p>" for text in (*data.problems, *machine.notes))
     return _PAGE.format(
         title=escape(f"{machine.config.name}: a mechanism for {Path(data.candidate.task.source or 'a curve').name}"),
         subtitle=escape(
@@ -104,7 +104,7 @@ def render_synthesis_page(data: SynthesisData, machine: MachineFiles) -> str:
         ),
         style=STYLE + _STYLE,
         tiles=_tiles(data, machine),
-        complaints=f"<h2>What check says</h2>{notes}" if notes else "",
+        complaints=f"<h2>To be noted</h2>{notes}" if notes else "",
         positions=figures["positions"],
         lengths=_lengths(data.candidate),
         terms=_terms(data.candidate),
@@ -222,9 +222,9 @@ def _tiles(data: SynthesisData, machine: MachineFiles) -> str:
         ),
         (
             "check",
-            "ready to run" if not machine.violations else f"{len(machine.violations)} complaints",
-            f"{machine.path.name}",
-            bool(machine.violations),
+            _readiness(len(data.problems)),
+            machine.path.name,
+            bool(data.problems),
         ),
     )
     return "".join(
@@ -232,6 +232,10 @@ def _tiles(data: SynthesisData, machine: MachineFiles) -> str:
         f"<small>{escape(below)}</small></div>"
         for what, figure, below, bad in tiles
     )
+
+
+def _readiness(problems: int) -> str:
+    return "ready to run" if problems == 0 else f"{problems} problem{'s' if problems > 1 else ''}"
 
 
 def _table(head: list[str], rows: list[list[str]], left: int = 0) -> str:
@@ -261,17 +265,35 @@ def significant(value: float) -> str:
     return f"{value:.6g}".replace("-", "−")
 
 
+_UNITS: Final = {
+    Term.STRUCTURAL_ERROR: "mm²",
+    Term.SWEPT_AREA: "mm deg",
+    Term.PEAK_TORQUE: "N m",
+    Term.CV_PEAK_TORQUE: "N m",
+    Term.POWER: "W",
+    Term.SERVO_VELOCITY: "rad/s",
+    Term.SERVO_ACCELERATION: "rad/s²",
+    Term.KEEP_OUT: "m",
+}
+
+
 def term_rows(candidate: Candidate) -> list[list[str]]:
-    """Term, value, weight, weighted value, and the sum."""
+    """Term, value, unit, weight, weighted value, and the sum."""
     rows = [
-        [entry.term.value, significant(float(value)), f"{entry.weight:g}", significant(float(value) * entry.weight)]
+        [
+            entry.term.value,
+            significant(float(value)),
+            _UNITS.get(entry.term, ""),
+            f"{entry.weight:g}",
+            significant(float(value) * entry.weight),
+        ]
         for entry, value in zip(candidate.task.terms, candidate.terms, strict=True)
     ]
-    return [*rows, ["weighted sum", "", "", significant(candidate.objective)]]
+    return [*rows, ["weighted sum", "", "", "", significant(candidate.objective)]]
 
 
 def _terms(candidate: Candidate) -> str:
-    return _table(["term", "value", "weight", "weighted"], term_rows(candidate))
+    return _table(["term", "value", "unit", "weight", "weighted"], term_rows(candidate))
 
 
 def _front_table(data: SynthesisData) -> str:

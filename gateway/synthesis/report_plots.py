@@ -29,13 +29,17 @@ _POSITIONS: Final = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SynthesisData:
-    """What the figures are drawn from; ``front`` is empty unless the method keeps one, ``chosen`` its chosen member."""
+    """What page and figures show.
+
+    ``front`` is empty unless the method keeps one, ``chosen`` its chosen member; ``problems``: what the machine fails.
+    """
 
     motion: LinkageMotion
     status: SearchStatus
     candidate: Candidate
     front: tuple[Found, ...] = ()
     chosen: Found | None = None
+    problems: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +114,8 @@ def _servo(data: SynthesisData, theme: Theme) -> Figure:
         (panels[1], np.append(motion.velocity, motion.velocity[0]), "velocity (rad/s)"),
         (panels[2], np.append(motion.acceleration, motion.acceleration[0]), "acceleration (rad/s²)"),
     ):
-        axes.axhline(0, color=theme.muted, lw=0.8)
+        if values.min() < 0.0 < values.max():
+            axes.axhline(0, color=theme.muted, lw=0.8)
         axes.plot(theta2, values, color=theme.servo)
         axes.set_ylabel(name)
         over_the_cycle(axes)
@@ -126,15 +131,14 @@ def _path(data: SynthesisData, theme: Theme) -> Figure:
     left.set_title("path of the end effector")
     legend(left, theme, loc="best", fontsize=8.5)
     track = data.candidate.servo_motion()
-    order = np.argsort(track.theta2)
-    error_mm = track.structural_error[order] * 1e3
-    right.plot(
-        np.degrees(track.theta2[order]), error_mm, "o-", ms=3, lw=1.0, color=theme.path, label="structural error"
-    )
+    within = np.degrees(track.theta2) % 360.0
+    order = np.argsort(within)
+    theta2, error_mm = within[order], track.structural_error[order] * 1e3
+    right.plot(theta2, error_mm, "o-", ms=3, lw=1.0, color=theme.path, label="structural error")
     tolerances = data.candidate.task.tolerances
     if tolerances is not None:
         right.step(
-            np.degrees(track.theta2[order]),
+            theta2,
             tolerances[order] * 1e3,
             where="mid",
             color=theme.bad,

@@ -123,7 +123,7 @@ class SynthesisSession:
             self.status, candidate, machine, motion, front, report_folder, _problems(candidate, machine, motion)
         )
         if report_folder is not None:
-            data = SynthesisData(motion, self.status, candidate, front, found if front else None)
+            data = SynthesisData(motion, self.status, candidate, front, found if front else None, outcome.problems)
             write_synthesis_report(report_folder, data, machine, outcome.document())
         return outcome
 
