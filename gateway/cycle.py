@@ -373,7 +373,8 @@ class CyclicLoop:
     def _miss_sync(self, now_ns: int) -> None:
         self.missing_syncs += 1
         self._flags |= SampleFlag.SYNC_LOST
-        self._sync_due_ns += self.period_ns
+        # A host that was away has its timers late too: they are given another period from now on.
+        self._sync_due_ns = max(self._sync_due_ns, now_ns - self.period_ns // SYNC_PATIENCE) + self.period_ns
         if self.missing_syncs >= SYNC_TAKE_OVER:
             # Without SYNC no drive takes a demand, not even that of a stop.
             self.is_paced = False

@@ -52,6 +52,7 @@ class CoupledStop:
         self._seen = 0
         """Actual value of the master that was seen last, in counts, and where it was then, in rad."""
         self._seen_position = 0.0
+        self._unseen_cycles = 0
         self._rest_from = 0
         self._rest_cycles = 0
         self.targets = [0, 0]
@@ -72,6 +73,7 @@ class CoupledStop:
         master, slave = self._master, self._slave
         self.targets = list(targets)
         self._cycle = 0
+        self._unseen_cycles = 0
         self._rest_cycles = 0
         self.is_finished = False
         revolution = master.units.counts_per_revolution
@@ -132,6 +134,7 @@ class CoupledStop:
             self.master_velocity = math.copysign(slower, self.master_velocity)
             self.master_position += self.master_velocity * period_s
             self._rest_cycles = self._rest_cycles + 1 if slower == 0.0 else 0
+            self._unseen_cycles += 1
             return
         actual = self._master.actual
         # From the last count seen to this one, and from there to where the observer has the master.
@@ -140,7 +143,9 @@ class CoupledStop:
         self._seen_position += moved * self._rad_per_count
         miss = self._seen_position - expected
         self.master_position = expected + POSITION_GAIN * miss
-        self.master_velocity += VELOCITY_GAIN * miss / period_s
+        # A miss that has grown for several cycles says so much less of the velocity: else rare sights make it swing up.
+        self.master_velocity += VELOCITY_GAIN * miss / (period_s * (self._unseen_cycles + 1))
+        self._unseen_cycles = 0
         if abs(wrap_counts(actual - self._rest_from)) > STANDSTILL_COUNTS:
             self._rest_from = actual
             self._rest_cycles = 0

@@ -160,6 +160,18 @@ def test_a_missing_sync_is_flagged_and_after_three_the_loop_sends_it_itself():
     assert not bench.loop.receive_sync(10 * MS), "whoever sends SYNC now is not this loop's pace"
 
 
+def test_a_host_that_was_away_does_not_take_its_late_timer_for_a_lost_one():
+    """The loop wakes 20 ms late; the kernel's SYNC was held up as long, and comes right after."""
+    bench = Bench()
+    bench.cycle(0)
+    bench.loop.wake(21 * MS)
+    assert bench.loop.next_wake_ns() == 22 * MS
+    bench.loop.wake(21 * MS + 10_000)
+    assert (bench.loop.missing_syncs, bench.loop.is_paced) == (1, True)
+    assert bench.cycle(21 * MS + 20_000) == [(0x201, 2), (0x202, -2)]
+    assert bench.loop.sync_due_ns == 22 * MS + 20_000
+
+
 def test_one_missing_sync_costs_no_step():
     bench = Bench()
     bench.cycle(0)
