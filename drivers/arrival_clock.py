@@ -16,7 +16,7 @@ class ArrivalClock:
     the time of day at all) is replaced by the present.
     """
 
-    __slots__ = ("_empty_ns", "_monotonic_ns", "_time_of_day_ns")
+    __slots__ = ("_empty_ns", "_monotonic_ns", "_now_ns", "_offset_ns", "_time_of_day_ns")
 
     def __init__(
         self,
@@ -26,16 +26,21 @@ class ArrivalClock:
         """``monotonic_ns`` and ``time_of_day_ns`` read the two clocks."""
         self._monotonic_ns = monotonic_ns
         self._time_of_day_ns = time_of_day_ns
-        self._empty_ns = monotonic_ns()
+        self._empty_ns = self._now_ns = monotonic_ns()
+        self._offset_ns = 0
 
     def queue_is_empty(self, at_ns: int | None = None) -> None:
         """Note that no frame was waiting at ``at_ns``, or is now, so that none can turn up that arrived earlier."""
         self._empty_ns = self._monotonic_ns() if at_ns is None else at_ns
 
+    def look(self) -> None:
+        """Read both clocks: ``arrival_ns`` converts by this reading until the next one."""
+        self._now_ns = now_ns = self._monotonic_ns()
+        self._offset_ns = now_ns - self._time_of_day_ns()
+
     def arrival_ns(self, stamp_ns: int) -> int:
         """Monotonic instant of the arrival that ``stamp_ns`` (time of day) marks."""
-        now_ns = self._monotonic_ns()
-        arrival_ns = now_ns - self._time_of_day_ns() + stamp_ns
-        if self._empty_ns - _SLACK_NS <= arrival_ns <= now_ns:
+        arrival_ns = stamp_ns + self._offset_ns
+        if self._empty_ns - _SLACK_NS <= arrival_ns <= self._now_ns:
             return arrival_ns
-        return now_ns
+        return self._now_ns

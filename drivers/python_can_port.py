@@ -99,6 +99,7 @@ class PythonCanPort:
                 continue
             data = b"" if message.is_remote_frame else bytes(message.data)
             frame = Frame(cob_id, data, message.is_remote_frame)
+            self._clock.look()
             return frame, self._clock.arrival_ns(round(message.timestamp * 1e9))
         self._may_hold_more = True
         return None

@@ -175,6 +175,7 @@ class SocketcanPort:
                 self._may_hold_more = False
                 self._empty_ns = time.monotonic_ns()
             if self._batch_count:
+                self._clock.look()
                 return True
         self._clock.queue_is_empty(self._empty_ns)
         self._may_hold_more = True
