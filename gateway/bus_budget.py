@@ -65,8 +65,8 @@ def budget_json(config: GatewayConfig) -> dict[str, Any]:
 def budget_table(config: GatewayConfig) -> Table:
     """The budget for a terminal."""
     budget = config.budget
-    title = f"Bus budget: {budget.cycle_us} us a cycle at {budget.bit_rate:,} bit/s, worst-case stuffing"
-    table = Table(title=title.replace(",", " "), title_justify="left", caption=_verdict(config), caption_justify="left")
+    title = f"Bus budget: {budget.cycle_us} us a cycle at {budget.bit_rate / 1000:g} kbit/s, worst-case stuffing"
+    table = Table(title=title, title_justify="left")
     table.add_column("")
     for name in ("bytes", "frames a cycle", "us a cycle", "share"):
         table.add_column(name, justify="right")
@@ -78,7 +78,8 @@ def budget_table(config: GatewayConfig) -> Table:
     return table
 
 
-def _verdict(config: GatewayConfig) -> str:
+def budget_verdict(config: GatewayConfig) -> str:
+    """What follows from it, in a sentence."""
     budget = config.budget
     if budget.is_within_bound:
         return (

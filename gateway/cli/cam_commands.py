@@ -45,7 +45,7 @@ DOWNLOAD_EPILOG = """Examples, with an emulated machine in another terminal (sim
 def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
     """Check a configuration: its keys, the cam against every limit, the bus budget. Nothing is opened or moved."""
     from config.loading import load_config
-    from gateway.bus_budget import budget_json, budget_table
+    from gateway.bus_budget import budget_json, budget_table, budget_verdict
     from gateway.preparation import prepare
 
     settings = load_config(config)
@@ -126,6 +126,7 @@ def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
             table.add_row(*row)
         console.print(table)
         console.print(budget_table(settings))
+        console.print(budget_verdict(settings), soft_wrap=True)
         console.print(
             f"run: {prepared.plan.duration_s:.2f} s, of which {settings.motion.machine_cycles} machine cycles or a "
             f"little more at constant speed ({prepared.plan.cruise_end_s - prepared.plan.cruise_start_s:.2f} s)"
