@@ -56,6 +56,13 @@ class Candidate:
                     f"({what.format(count=round(float(np.cbrt(value))), value=value)})",
                     term.value,
                 )
+        error = self.value(Term.STRUCTURAL_ERROR)
+        if self.task.tolerances is not None and error is not None and error > 0.0:
+            raise SynthesisError(
+                "no feasible mechanism found within the bounds: the term structural error cannot be met "
+                f"(the points miss their tolerances by {np.sqrt(error):.3g} mm in all at best)",
+                Term.STRUCTURAL_ERROR.value,
+            )
 
 
 _FAULTS = (

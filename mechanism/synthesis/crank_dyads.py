@@ -3,7 +3,8 @@
 The structural error depends on these four variables alone: every point P must lie at the distance q from the crank's
 end c + p e(theta2), so P.P = 2 P.c + 2 p P.e - 2 p c.e + (q^2 - c.c - p^2). Taken as a linear equation in c, p, p c and
 the bracket it is solved by least squares at once; a curve that a five-bar has traced gives its crank dyad back.
-Where the curve is no such one, the solution is a start from which least squares of the true distances goes on.
+Where the curve is no such one, the solution is a start from which least squares of the true distances goes on. With
+free timing, other crank dyads suit: those that can go round at all.
 """
 
 from collections.abc import Callable
@@ -23,6 +24,7 @@ _TRACED: Final = 1e-9
 """A curve that a crank dyad misses by less than so much of its size has been traced by one."""
 _KEPT: Final = 6
 _SEEDED_SHARE: Final = 0.25
+_ATTEMPTS: Final = 10
 CRANK_VARIABLES: Final = (Variable.P, Variable.Q, Variable.CV_PIVOT_X, Variable.CV_PIVOT_Y)
 
 
@@ -131,10 +133,33 @@ def suitable_cranks(task: SynthesisTask, random: np.random.Generator) -> tuple[l
     return [crank for _, crank in found[:_KEPT]], evaluations
 
 
+def _cranks_that_go_round(task: SynthesisTask, random: np.random.Generator, count: int) -> list[Float]:
+    """Crank dyads for free timing with their pivot somewhere beside the curve.
+
+    Such a crank can go round only if p and q come in line, stretched, where the curve is farthest from the pivot, and
+    folded where it is nearest: p + q and q - p are these distances.
+    """
+    columns = list(CRANK_VARIABLES)
+    lower, upper = task.bounds.lower[columns], task.bounds.upper[columns]
+    found: list[Float] = []
+    for pivot in random.uniform(lower[2:], upper[2:], (_ATTEMPTS * count, 2)):
+        distance = np.hypot(task.x - pivot[0], task.y - pivot[1])
+        nearest, farthest = float(distance.min()), float(distance.max())
+        crank = np.array([0.5 * (farthest - nearest), 0.5 * (farthest + nearest), *pivot])
+        if np.all(crank >= lower) and np.all(crank <= upper):
+            found.append(crank)
+        if len(found) == count:
+            break
+    return found
+
+
 def seeded_population(run: Run, random: np.random.Generator, size: int) -> Float:
-    """A first population (m, 8) in the unit cube: at random, a quarter of it with suitable crank dyads."""
+    """A first population (m, 8) in the unit cube: at random, a quarter of it with crank dyads that suit the curve."""
     unit = random.random((size, VARIABLE_COUNT))
-    cranks, evaluations = suitable_cranks(run.task, random)
+    if run.task.timing is Timing.FREE:
+        cranks, evaluations = _cranks_that_go_round(run.task, random, int(_SEEDED_SHARE * size)), 0
+    else:
+        cranks, evaluations = suitable_cranks(run.task, random)
     run.ledger.evaluations += evaluations
     if cranks:
         variables = run.spread(unit)

@@ -18,10 +18,19 @@ from synthesis_samples import (
 )
 
 from mechanism.errors import ParameterError, SynthesisError
-from mechanism.synthesis.crank_dyads import CRANK_VARIABLES, algebraic_crank, radial_errors, suitable_cranks
+from mechanism.synthesis.candidate import Candidate
+from mechanism.synthesis.crank_dyads import (
+    CRANK_VARIABLES,
+    algebraic_crank,
+    radial_errors,
+    seeded_population,
+    suitable_cranks,
+)
 from mechanism.synthesis.genetic_kernels import BITS, DRAWS, STRING, breed, decode, scale_fitness
+from mechanism.synthesis.ledger import Ledger
 from mechanism.synthesis.objective import evaluate, weighted_sum
 from mechanism.synthesis.pareto import PARETO_TERMS
+from mechanism.synthesis.run import Run
 from mechanism.synthesis.search import Method, Phase, Progress, search
 from mechanism.synthesis.state import pack, unpack
 from mechanism.synthesis.task import Bounds, SynthesisTask, Term, Timing, WeightedTerm
@@ -197,6 +206,31 @@ def test_no_feasible_mechanism_names_the_term() -> None:
     with pytest.raises(SynthesisError, match=r"mobility cannot be met .* in 36 positions") as error:
         best.require_feasible()
     assert error.value.term == Term.MOBILITY.value
+
+
+def test_a_tolerance_that_cannot_be_met_is_named() -> None:
+    """A crank held at 50 mm cannot follow: the error is what is left, and counts only where tolerances are given."""
+    lower, upper = NEAR_BOUNDS.lower.copy(), NEAR_BOUNDS.upper.copy()
+    lower[0] = upper[0] = 0.05
+    task = replace(paper_task(), bounds=Bounds(lower, upper), tolerances=np.full(36, 0.0005))
+    best = last(search(task, Method.DIFFERENTIAL_EVOLUTION, 1, BUDGET)).best
+    assert best.value(Term.MOBILITY) == 0.0
+    with pytest.raises(SynthesisError, match="structural error cannot be met") as error:
+        best.require_feasible()
+    assert error.value.term == Term.STRUCTURAL_ERROR.value
+    Candidate(replace(task, tolerances=None), best.variables, best.terms, best.objective).require_feasible()
+
+
+def test_free_cranks_stand_where_they_can_go_round() -> None:
+    """Of the seeded quarter, q + p and q - p are the curve's greatest and least distance from the pivot."""
+    task = replace(known_task(0), timing=Timing.FREE, theta2=None)
+    run = Run(task, Ledger(task, lambda rows: evaluate(task, rows), 1000), 1, 800, True, None, 1, None)
+    rows = run.spread(seeded_population(run, np.random.default_rng(1), 40))[:10]
+    distance = np.hypot(task.x - rows[:, 4:5], task.y - rows[:, 5:6])
+    np.testing.assert_allclose(rows[:, 0] + rows[:, 1], distance.max(axis=1), rtol=1e-9)
+    np.testing.assert_allclose(rows[:, 1] - rows[:, 0], distance.min(axis=1), rtol=1e-9)
+    error = evaluate(task, rows)[:, 0]
+    np.testing.assert_allclose(error, 0.0, atol=1e-9)
 
 
 def test_held_variables_stay() -> None:
