@@ -29,6 +29,7 @@ from gateway.demand import CamDemand
 from gateway.errors import CommissioningError, GatewayError
 from gateway.guard import Condition, Guard, StopReason
 from gateway.learning import LearnedTorque
+from gateway.operation import Operation, Order, OrderAnswered
 from gateway.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.recovery import Recovery
 from gateway.sample import Phase
@@ -103,6 +104,10 @@ class GatewayCore:
         self._approach = approach
         self._way: tuple[Point, ...] = ()
         """Corners of the approach; none where the machine stands at the plan's start."""
+        self.operation: Operation | None = None
+        """Who carries out an operator's orders; None takes none."""
+        self._is_following = False
+        """The demand on the cam is, or has been, followed."""
         self._is_stop_requested = False
         self._is_watching_nodes = False
         """Set once the drives are configured: one that restarts or falls silent after that is not what it was."""
@@ -194,6 +199,15 @@ class GatewayCore:
         if self.loop.is_guarding_enabled:
             self._guard.hold(wish, 0, 1, 1, self.master.now_ns)
             self.loop.react()
+
+    def order(self, order: Order, value: float) -> None:
+        """Carry out an operator's order, or refuse it; an ``OrderAnswered`` tells which."""
+        now_ns = self.master.now_ns
+        if self.operation is None or not self._is_following or not self._may_move():
+            answer = OrderAnswered(now_ns, order, value, "the machine is not in motion on its cam")
+        else:
+            answer = self.operation.carry_out(order, value, self._plan.end_position, now_ns)
+        self._events.append(answer)
 
     def request_quick_stop(self) -> None:
         """Quick stop on all drives."""
@@ -367,6 +381,7 @@ class GatewayCore:
             self._step("moving")
             demand.begin(self._plan, [axis.channel.target for axis in self._axes])
             loop.follow(demand, demand.observer)
+            self._is_following = True
             while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
                 if self._is_stop_requested:
                     loop.controlled_stop()

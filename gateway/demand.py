@@ -7,7 +7,8 @@ from gateway.sample import Phase
 from gateway.torque_offsets import TorqueOffsets
 from gateway.units import AxisUnits, wrap_counts
 from mechanism.cam_profile import CamProfile
-from mechanism.motion import MasterPhase, MasterPlan, plan_stop
+from mechanism.motion import MasterPhase, MasterPlan, plan_change, plan_jog, plan_stop
+from mechanism.slave_law import SlaveLaw
 
 APPROACH_S: Final = 0.25
 MASTER: Final = 0
@@ -59,12 +60,15 @@ class CamDemand:
         acceleration_limit: float,
         jerk_limit: float,
         torques: TorqueOffsets | None = None,
+        law: SlaveLaw | None = None,
     ) -> None:
         """``acceleration_limit`` (rad/s^2) and ``jerk_limit`` (rad/s^3) bound the master's controlled stop.
 
-        ``torques`` makes the torque offsets, which are all 0 without it.
+        ``torques`` makes the torque offsets, which are all 0 without it. ``law`` is where the slave is for every angle
+        of the master; None is the cam itself.
         """
         self._cam = cam
+        self.law = SlaveLaw(cam) if law is None else law
         self._units = units
         self._period_s = period_s
         self._limits = (acceleration_limit, jerk_limit)
@@ -73,6 +77,8 @@ class CamDemand:
         self._step = 0
         self._acceleration = 0.0
         self._is_stopping = False
+        self.is_paused = False
+        """The master stands, or jogs, before the plan's end, and somebody will say how it goes on."""
         self._turns = (0, 0)
         """Whole revolutions, in counts, that each axis stands away from the plan's: see ``align``."""
         self._approach = (0, 0)
@@ -114,7 +120,8 @@ class CamDemand:
     @property
     def is_finished(self) -> bool:
         """Whether the plan has been followed to its end."""
-        return self._plan is not None and self._step * self._period_s >= self._plan.duration_s
+        is_over = self._plan is not None and self._step * self._period_s >= self._plan.duration_s
+        return is_over and not self.is_paused
 
     def align(self, master_position: float, actuals: tuple[int, int]) -> tuple[int, int]:
         """Counts of both axes with the master at this theta2: where they must stand before a plan begins there.
@@ -139,7 +146,8 @@ class CamDemand:
         self._step += 1
         at_s = self._step * self._period_s
         position, velocity, self._acceleration = plan.at(at_s)
-        theta5, slope, _, _ = self._cam.at(position)
+        self.law.advance(position, self._period_s)
+        theta5, slope = self.law.at(position)
         self.master_position = position
         self.master_velocity = velocity
         self.velocities = [velocity, slope * velocity]
@@ -156,16 +164,39 @@ class CamDemand:
             for number, away in enumerate(self._approach):
                 self.targets[number] = wrap_counts(self.targets[number] + round(share * away))
         if self._torques is not None:
-            self.torque_offsets = self._torques.at(position, velocity, self._acceleration, 1.0 - share)
+            self.torque_offsets = self._torques.at(
+                position, velocity, self._acceleration, (1.0 - share) * self.law.plainness(position)
+            )
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         self.phase = phase
         if self._is_stopping and phase is not Phase.STANDSTILL:
             self.phase = Phase.CONTROLLED_STOP
 
+    def go_on(self, speed: float, end: float) -> None:
+        """Change the master's speed (rad/s, positive) from the next step on, or start it again, and end at ``end``, or
+        so many whole revolutions later. Raises mechanism.errors.MotionError.
+        """
+        state = self.master_position, self.master_velocity, self._acceleration
+        self._follow(plan_change(*state, speed, end, *self._limits))
+        self.is_paused = False
+
+    def jog(self, speed: float) -> None:
+        """Go at this speed (rad/s, either sign; 0 stands) until told otherwise. Raises mechanism.errors.MotionError."""
+        state = self.master_position, self.master_velocity, self._acceleration
+        plan = plan_jog(*state, speed, *self._limits) if speed else plan_stop(*state, *self._limits)
+        self._follow(plan)
+        self.is_paused = True
+
+    @property
+    def is_stopping(self) -> bool:
+        """A controlled stop is under way, or done: nothing goes on after it."""
+        return self._is_stopping
+
     def controlled_stop(self) -> None:
         """Ramp the master down from where it is; see ``Demand``."""
         if self._is_stopping or self._plan is None:
             return
+        self.is_paused = False
         plan = plan_stop(self.master_position, self.master_velocity, self._acceleration, *self._limits)
         self._follow(plan)
         self._is_stopping = True

@@ -10,6 +10,7 @@ from drivers.node import Event
 from gateway.commissioning import BootUpMissing
 from gateway.core import StepReached
 from gateway.guard import Condition, GuardTripped
+from gateway.operation import OrderAnswered
 from gateway.recovery import AxisRecovered
 
 _UNITS: Final = {
@@ -46,6 +47,10 @@ def describe(event: Event) -> tuple[str, str, EventData]:
                 f"axis {axis}: {said}",
                 {"axis": axis, "is_ready": is_ready, "anew": is_commissioned_anew},
             )
+        case OrderAnswered(_, order, value, refusal):
+            name = order.name.lower().replace("_", " ")
+            text = f"{name} {value:g} " + (f"refused: {refusal}" if refusal else "taken")
+            return "order", text, {"order": name, "value": value, "refusal": refusal}
         case BootUpMissing(_, node_id):
             return "boot_up", f"node {node_id} answers, but sends no boot-up message", {"node_id": node_id}
         case NodeStateChanged(_, node_id, state):

@@ -18,6 +18,7 @@ from gateway.demand import CamDemand
 from gateway.errors import GatewayError
 from gateway.guard import Guard
 from gateway.learning import Learning, build_learning
+from gateway.operation import Operation
 from gateway.powering import AxisSetup
 from gateway.reactions import CoupledStop
 from gateway.torque_offsets import build_torque_offsets, torque_violations
@@ -28,7 +29,10 @@ from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import CamLimitError, MechanismError
 from mechanism.motion import MasterPlan, plan_run
+from mechanism.slave_law import LawLimits, SlaveLaw
 
+JOG_SHARE: Final = 4.0
+"""A jog is at most so many times slower than the run."""
 RAMP_GRID: Final = 4096
 WHOLE_REVOLUTION: Final = 1e-9
 """Share of a revolution that is rounding, and asks for no revolution more."""
@@ -164,7 +168,22 @@ def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[Gateway
     ]
 
 
-def guard_limits(config: GatewayConfig, profile: CamProfile) -> tuple[list[AxisLimits], CamWindow]:
+def slave_law(config: GatewayConfig, profile: CamProfile) -> SlaveLaw:
+    """Where the slave is for every angle of the master: on the cam, until somebody shifts it or takes it off."""
+    slave = config.ordered_axes[1].limits
+    return SlaveLaw(
+        profile,
+        LawLimits(
+            five_bar(config),
+            closure_at_home(config, desired_curve(config)),
+            config.machine.minimum_transmission_sine,
+            slave.velocity_rad_per_s,
+            slave.acceleration_rad_per_s2,
+        ),
+    )
+
+
+def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits], CamWindow]:
     """What the guard compares every cycle with, in the cycle's own units."""
     guard = config.guard
     axes = [
@@ -184,8 +203,7 @@ def guard_limits(config: GatewayConfig, profile: CamProfile) -> tuple[list[AxisL
     return axes, CamWindow(
         geometry=five_bar(config).to_array(),
         closure=int(closure_at_home(config, desired_curve(config))),
-        coefficients=profile.coefficients,
-        net_turns=profile.net_turns,
+        law=law,
         rad_per_count=(math.tau / master.counts_per_revolution, math.tau / slave.counts_per_revolution),
         window_rad=math.radians(guard.cam_window.limit_deg),
         end_effector_m=guard.end_effector_error.limit_mm / 1e3,
@@ -273,10 +291,11 @@ def build_core(
         for node, channel, axis in zip(node_settings(config), channels, config.ordered_axes, strict=True)
     ]
     guard = Guard(config.guard, config.axis_names)
-    watch = CycleWatch(guard, channels, *guard_limits(config, profile))
+    law = slave_law(config, profile)
+    watch = CycleWatch(guard, channels, *guard_limits(config, law))
     deceleration = config.ordered_axes[0].limits.quick_stop_deceleration_rad_per_s2
     coupled_stop = CoupledStop(
-        profile,
+        law,
         channels,
         guard,
         config.cycle_s,
@@ -297,9 +316,10 @@ def build_core(
         config.motion.ramp_acceleration_rad_per_s2,
         config.motion.ramp_jerk_rad_per_s3,
         build_torque_offsets(config, profile, units, learning),
+        law,
     )
     approach = None if approach_cycles is None else build_approach(config, profile, approach_cycles)
-    return GatewayCore(
+    core = GatewayCore(
         setups,
         network_settings(config),
         build_master(config),
@@ -312,6 +332,10 @@ def build_core(
         approach,
         config.recovery.timeout_s,
     )
+    core.operation = Operation(
+        demand, config.speed_rad_per_s, config.motion.approach_speed_rad_per_s, config.speed_rad_per_s / JOG_SHARE
+    )
+    return core
 
 
 def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: int) -> Approach:

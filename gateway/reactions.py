@@ -15,7 +15,7 @@ from gateway.guard import Guard
 from gateway.sample import Phase
 from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
 from gateway.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK
-from mechanism.cam_profile import CamProfile
+from mechanism.slave_law import SlaveLaw
 
 REACHED_AFTER_CYCLES: Final = 2
 """A target sent now is applied at the next SYNC and reached at the one after it."""
@@ -35,10 +35,10 @@ class CoupledStop:
     """A `gateway.demand.Demand` for two axes, master first, that takes over from the one that was followed."""
 
     def __init__(
-        self, cam: CamProfile, axes: Sequence[AxisChannel], guard: Guard, period_s: float, deceleration: float
+        self, law: SlaveLaw, axes: Sequence[AxisChannel], guard: Guard, period_s: float, deceleration: float
     ) -> None:
         """``deceleration`` (rad/s^2): of the master's quick stop ramp, for as long as it cannot be seen."""
-        self._cam = cam
+        self._law = law
         self._master, self._slave = axes
         self._guard = guard
         self._period_s = period_s
@@ -86,7 +86,7 @@ class CoupledStop:
         self.master_velocity = master_velocity
         revolution = slave.units.counts_per_revolution
         ahead = position + master_velocity * REACHED_AFTER_CYCLES * self._period_s
-        away = wrap_counts(targets[SLAVE] - slave.units.counts(self._cam.at(ahead)[0]))
+        away = wrap_counts(targets[SLAVE] - slave.units.counts(self._law.at(ahead)[0]))
         # The turns by which the slave stands away from the cam's first one stay what they were.
         self._turns = round(away / revolution) * revolution
         self._offset = away - self._turns
@@ -107,7 +107,7 @@ class CoupledStop:
         if self.is_finished:
             return
         ahead = self.master_position + self.master_velocity * REACHED_AFTER_CYCLES * self._period_s
-        theta5, slope, _, _ = self._cam.at(ahead)
+        theta5, slope = self._law.at(ahead)
         left = max(1.0 - self._cycle / self._blend_cycles, 0.0)
         target = slave.units.counts(theta5) + self._turns + round(left * left * (3.0 - 2.0 * left) * self._offset)
         # New lists: whoever keeps the last ones keeps that step's values.

@@ -11,7 +11,8 @@ from gateway.axis_channel import AxisChannel
 from gateway.guard import Condition, Guard
 from gateway.sample import INT32_MAX, Phase
 from gateway.units import HALF_RANGE, RANGE_MASK
-from mechanism.deviation import deviation
+from mechanism.deviation import end_effector_miss
+from mechanism.slave_law import SlaveLaw
 
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
@@ -36,12 +37,11 @@ NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CamWindow:
-    """The cam and the linkage as `mechanism.deviation` takes them, and how far the machine may be from them."""
+    """The linkage as `mechanism.deviation` takes it, where its slave is to be, and how far it may be from there."""
 
     geometry: NDArray[np.float64]
     closure: int
-    coefficients: NDArray[np.float64]
-    net_turns: int
+    law: SlaveLaw
     rad_per_count: tuple[float, float]
     """Master, slave."""
     window_rad: float
@@ -73,7 +73,7 @@ class CycleWatch:
         """Whether the actual value of the cycle before is known."""
         if cam is not None:
             # The first call loads the machine code, which must not happen within a cycle.
-            self._deviation(cam, 0.0, 0.0, 0.0)
+            end_effector_miss(cam.geometry, cam.closure, 0.0, 0.0, 0.0, 0.0)
 
     def check(
         self, awaited: int, targets: Sequence[int], master_position: float, phase: Phase, is_enabled: bool, now_ns: int
@@ -161,15 +161,15 @@ class CycleWatch:
         if travelled > limits.frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, travelled, limits.frozen_counts, now_ns)
 
-    def _deviation(self, cam: CamWindow, theta2: float, error2: float, error5: float) -> tuple[float, float]:
-        return deviation(cam.geometry, cam.closure, cam.coefficients, cam.net_turns, theta2, error2, error5)
-
     def _check_cam(self, cam: CamWindow, targets: Sequence[int], master_position: float, now_ns: int) -> None:
         guard = self._guard
         (master, slave), (master_scale, slave_scale) = self._axes, cam.rad_per_count
         error2 = ((targets[0] - master.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE) * master_scale
         error5 = ((targets[1] - slave.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE) * slave_scale
-        window, miss = self._deviation(cam, master_position, error2, error5)
+        law = cam.law
+        theta5 = law.at(master_position)[0]
+        miss = end_effector_miss(cam.geometry, cam.closure, master_position, theta5, error2, error5)
+        window = theta5 - error5 - law.at(master_position - error2)[0]
         if not -cam.window_rad <= window <= cam.window_rad:
             guard.hold(
                 Condition.CAM_WINDOW, 0, _counts(window, slave_scale), _counts(cam.window_rad, slave_scale), now_ns

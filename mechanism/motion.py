@@ -6,7 +6,7 @@ The time-optimal ramps are ruckig's. A plan is a list of pieces of constant jerk
 from bisect import bisect_right
 from dataclasses import dataclass
 from enum import IntEnum, unique
-from math import ceil, copysign, tau
+from math import ceil, copysign, inf, tau
 from typing import Any, Final, cast
 
 import ruckig
@@ -201,3 +201,43 @@ def plan_stop(
         raise MotionError("the master's position, velocity and acceleration must be finite")
     pieces, duration_s, end = _ramp(0.0, position, velocity, acceleration, 0.0, acceleration_limit, jerk_limit)
     return _plan(pieces, duration_s, 0.0, 0.0, 0.0, end)
+
+
+def plan_change(
+    position: float,
+    velocity: float,
+    acceleration: float,
+    speed: float,
+    end: float,
+    acceleration_limit: float,
+    jerk_limit: float,
+) -> MasterPlan:
+    """From any state (rad, rad/s, rad/s^2) to another speed (rad/s, positive), on at it, and down to rest at ``end``.
+
+    Where ``end`` is too near to stop at, the plan ends so many whole revolutions later. Raises MotionError.
+    """
+    _check_limits(acceleration_limit, jerk_limit)
+    if not (finite(position, velocity, acceleration, speed, end) and speed > 0.0):
+        raise MotionError(f"the master cannot go on at {speed:g} rad/s: the speed must be positive and finite")
+    limits = acceleration_limit, jerk_limit
+    up, up_end_s, up_end = _ramp(0.0, position, velocity, acceleration, speed, *limits)
+    _, _, down_distance = _ramp(0.0, 0.0, speed, 0.0, 0.0, *limits)
+    end += max(ceil((up_end + down_distance - end) / tau - _REVOLUTION_TOLERANCE), 0) * tau
+    cruise_end_s = up_end_s + max((end - down_distance - up_end) / speed, 0.0)
+    down, duration_s, _ = _ramp(cruise_end_s, end - down_distance, speed, 0.0, 0.0, *limits)
+    pieces = [*up, _Piece(up_end_s, up_end, speed, 0.0, 0.0), *down]
+    return _plan(pieces, duration_s, up_end_s, cruise_end_s, speed, end)
+
+
+def plan_jog(
+    position: float, velocity: float, acceleration: float, speed: float, acceleration_limit: float, jerk_limit: float
+) -> MasterPlan:
+    """From any state (rad, rad/s, rad/s^2) to a speed (rad/s, either sign), and on at it without end.
+
+    Raises MotionError.
+    """
+    _check_limits(acceleration_limit, jerk_limit)
+    if not finite(position, velocity, acceleration, speed):
+        raise MotionError("the master's position, velocity, acceleration and speed must be finite")
+    up, up_end_s, up_end = _ramp(0.0, position, velocity, acceleration, speed, acceleration_limit, jerk_limit)
+    return _plan([*up, _Piece(up_end_s, up_end, speed, 0.0, 0.0)], inf, up_end_s, inf, speed, up_end)

@@ -10,14 +10,14 @@ from config.guard_section import Reaction
 from config.loading import ConfigError, load_config, parse_config
 from gateway.axis_channel import AxisChannel
 from gateway.guard import REASON_OF, Condition, Guard, StopReason
-from gateway.preparation import guard_limits, prepare
+from gateway.preparation import compile_config, guard_limits, slave_law
 from gateway.sample import Phase
 from gateway.units import AxisUnits
 from gateway.watch import AxisLimits, CycleWatch
-from mechanism.cam_profile import CamProfile
-from mechanism.deviation import deviation
+from mechanism.deviation import end_effector_miss
 
 PAPER = load_config("paper")
+PROFILE = compile_config(PAPER).profile
 UNITS = AxisUnits(4096, 0.0, 1.5)
 ENABLED, FAULT = 0x1237, 0x0218
 LIMITS = AxisLimits(velocity_counts_per_cycle=20.5, torque_permille=2500, frozen_counts=11)
@@ -82,7 +82,7 @@ def make(limits=LIMITS, **replaced):
     axes = [AxisChannel("cv", 1, UNITS, 200), AxisChannel("servo", 2, UNITS, 300)]
     for axis in axes:
         axis.statusword = ENABLED
-    watch = CycleWatch(guard, axes, [limits, limits], guard_limits(PAPER, prepare(PAPER, 1).cam.profile)[1])
+    watch = CycleWatch(guard, axes, [limits, limits], guard_limits(PAPER, slave_law(PAPER, PROFILE))[1])
     return guard, axes, watch
 
 
@@ -173,15 +173,12 @@ def test_the_window_around_the_cam_and_the_end_effector():
     ]
 
 
-def test_deviation_by_hand():
-    """A square of p = s = 1, q = r, the pivots a diagonal apart: C stands symmetrically above the middle."""
+def test_the_end_effectors_distance_by_hand():
+    """A square of p = s = 1, q = r = 2, the pivots 2 apart: C stands symmetrically above the middle."""
     geometry = np.array([1.0, 2.0, 2.0, 1.0, 0.0, 0.0, 2.0, 0.0])
     # theta2 = theta5 = 90 deg: A (0, 1), D (2, 1), C = (1, 1 + sqrt 3). Turned by -90 deg each, C moves by (1, -1).
     quarter = math.pi / 2
-    cam = CamProfile.through(np.arange(8) * math.tau / 8, np.full(8, quarter), knots=8)
-    window, miss = deviation(geometry, 1, cam.coefficients, 0, quarter, quarter, quarter)
-    assert window == pytest.approx(-quarter)
-    assert miss == pytest.approx(math.sqrt(2.0))
+    assert end_effector_miss(geometry, 1, quarter, quarter, quarter, quarter) == pytest.approx(math.sqrt(2.0))
     # No closure: far out of reach.
     far = np.array([1.0, 0.1, 0.1, 1.0, 0.0, 0.0, 9.0, 0.0])
-    assert all(math.isnan(value) for value in deviation(far, 1, cam.coefficients, 0, 0.0, 0.0, 0.0))
+    assert math.isnan(end_effector_miss(far, 1, 0.0, 0.0, 0.0, 0.0))

@@ -1,0 +1,141 @@
+"""Orders to a machine in motion: override, pause, jog, phase shift, the slave off its cam and back."""
+
+import math
+
+import numpy as np
+import pytest
+from guarded_machine import PAPER, Guarded, at_theta2
+
+from gateway.guard import StopReason
+from gateway.operation import Order, OrderAnswered
+from gateway.sample import Phase, SampleLayout
+
+LAYOUT = SampleLayout(PAPER.axis_names)
+
+
+def samples_of(run):
+    return np.frombuffer(b"".join(LAYOUT.pack(*sample) for sample in run.samples), LAYOUT.dtype)
+
+
+class Operated(Guarded):
+    def order(self, at_s, order, value):
+        self.until(at_s)
+        self.core.order(order, value)
+        self.bus.refresh()
+        return self
+
+    @property
+    def refusals(self):
+        return [event.refusal for event in self.events if isinstance(event, OrderAnswered)]
+
+
+def assert_whole_and_home(run):
+    assert run.stopped_by is StopReason.COMPLETED
+    assert not run.is_torn
+    assert run.strain(0.5).least_sine > 0.75
+    home = math.degrees(math.remainder(run.machine.plant.angle(0), math.tau))
+    assert home == pytest.approx(0.0, abs=1.5)
+
+
+def assert_within_the_masters_limits(run):
+    """Velocity from plan to plan: differences of the demand's own velocity bound acceleration and jerk."""
+    velocity = samples_of(run)["master_velocity"]
+    acceleration = np.diff(velocity) / 1e-3
+    assert np.abs(acceleration).max() <= PAPER.motion.ramp_acceleration_rad_per_s2 * 1.001
+    jerk = np.diff(acceleration) / 1e-3
+    assert np.abs(jerk).max() <= PAPER.motion.ramp_jerk_rad_per_s3 * 1.01
+
+
+def test_override_pause_and_jog_are_smooth_and_the_run_ends_at_home():
+    run = Operated(cycles=1)
+    run.order(1.9, Order.OVERRIDE, 40.0).order(2.6, Order.OVERRIDE, 0.0)
+    run.order(2.7, Order.JOG, 101.0).until(4.2)
+    assert run.core.loop.phase is Phase.STANDSTILL
+    stood_at = run.core.loop.axes[0].actual
+    run.order(4.2, Order.JOG, -6.0).order(5.2, Order.JOG, 0.0).until(6.0)
+    # Back at 6 rpm for a second, less the ramps: about a tenth of a revolution.
+    assert 300 < stood_at - run.core.loop.axes[0].actual < 420
+    run.order(6.0, Order.OVERRIDE, 100.0)
+    run.to_end()
+    assert [refusal[:20] for refusal in run.refusals] == ["", "", "a jog at 101 rpm is ", "", "", ""]
+    assert_whole_and_home(run)
+    assert_within_the_masters_limits(run)
+    assert run.strain(0.5).cam_distance_rad < math.radians(6.0)
+
+
+@pytest.mark.slow
+def test_a_stop_of_a_machine_that_waits_ends_the_run():
+    run = Operated(cycles=1).order(1.9, Order.OVERRIDE, 0.0).until(3.5)
+    run.core.request_stop()
+    run.bus.refresh()
+    run.to_end()
+    assert run.stopped_by is StopReason.OPERATOR
+    assert run.is_without_torque
+
+
+@pytest.mark.slow
+def test_a_phase_shift_moves_the_slave_along_its_cam_and_back():
+    run = Operated(cycles=2).order(at_theta2(10), Order.PHASE_SHIFT, 5.0)
+    run.until(at_theta2(130))
+    theta2, theta5 = (run.machine.plant.angle(axis) for axis in (0, 1))
+    shifted = run.prepared.cam.profile.at(theta2 + math.radians(5.0))[0]
+    assert theta5 == pytest.approx(shifted, abs=math.radians(2.5))
+    assert theta5 - run.prepared.cam.profile.at(theta2)[0] > math.radians(1.0)
+    run.order(at_theta2(140), Order.PHASE_SHIFT, 0.0).to_end()
+    assert run.refusals == ["", ""]
+    assert run.core.loop._demand is None
+    assert_whole_and_home(run)
+    assert run.trips == []
+
+
+def test_the_slave_leaves_its_cam_at_an_angle_and_returns_at_another():
+    run = Operated(cycles=3).order(at_theta2(180), Order.DISENGAGE, 200.0)
+    run.until(at_theta2(280))
+    parked = run.machine.plant.angle(1)
+    run.until(at_theta2(280) + 0.4)
+    assert run.machine.plant.angle(1) == pytest.approx(parked, abs=math.radians(1.0))
+    assert run.order(at_theta2(280) + 0.45, Order.DISENGAGE, 10.0).refusals[-1] == "the slave is off its cam already"
+    run.order(at_theta2(280) + 0.5, Order.ENGAGE, 200.0).to_end()
+    assert run.refusals == ["", "the slave is off its cam already", ""]
+    samples = samples_of(run)
+    limits = PAPER.axes["servo"].limits
+    step = np.abs(np.diff(samples["position_demand"][samples["phase"] == Phase.CAM, 1])).max()
+    assert step * math.tau / 4096 / 1e-3 < limits.velocity_rad_per_s
+    assert run.stopped_by is StopReason.COMPLETED
+    assert run.strain(at_theta2(280)).least_sine > 0.4
+    assert run.trips == []
+
+
+@pytest.mark.parametrize(
+    ("order", "value", "sentence"),
+    [
+        (Order.DISENGAGE, 300.0, "would bring the linkage to a transmission sine of"),
+        (Order.PHASE_SHIFT, 170.0, "would bring the linkage to a transmission sine of"),
+        (Order.OVERRIDE, 101.0, "is not 0 to 100 %"),
+        (Order.ENGAGE, 0.0, "the slave is on its cam already"),
+    ],
+)
+def test_what_would_break_something_is_refused_and_changes_nothing(order, value, sentence):
+    run = Operated(cycles=1).order(at_theta2(10), order, value)
+    run.until(at_theta2(20))
+    assert sentence in run.refusals[0]
+    assert run.core.loop._demand.law.is_plain
+
+
+def test_before_the_motion_every_order_is_refused():
+    assert Operated().order(0.05, Order.OVERRIDE, 50.0).until(0.06).refusals == [
+        "the machine is not in motion on its cam"
+    ]
+
+
+@pytest.mark.slow
+def test_a_quick_stop_with_the_slave_off_its_cam_leaves_it_there():
+    run = Operated(cycles=3).order(at_theta2(180), Order.DISENGAGE, 200.0).until(at_theta2(280) + 0.3)
+    parked = run.machine.plant.angle(1)
+    run.core.request_quick_stop()
+    run.bus.refresh()
+    run.to_end()
+    # The brake of the master swings the slave, which holds its place, by 2.6 deg.
+    assert run.machine.plant.angle(1) == pytest.approx(parked, abs=math.radians(4.0))
+    assert run.is_without_torque
+    assert not run.is_torn
