@@ -14,6 +14,8 @@ HEARTBEAT_BYTES: Final = 1
 SDO_BYTES: Final = 8
 LATEST_TPDO: Final = 0.8
 """The TPDOs' deadline is at this share of the cycle at the latest."""
+HOST_LEAST_US: Final = 250.0
+"""What the gateway's own work may take on a bus without a wire: python-can's sockets and a busy host."""
 HOST_MARGIN: Final = 0.05
 """Share of the cycle that the gateway's own work may take after the TPDOs' deadline."""
 _MAX_VALUE: Final = 255
@@ -74,6 +76,11 @@ class BusBudget:
 
 
 HEARTBEATS: Final = "heartbeats"
+
+
+def deadline_without_wire_us(cycle_us: int) -> float:
+    """How long after SYNC TPDOs can be waited for where frames take no time."""
+    return max(min(LATEST_TPDO * cycle_us, cycle_us - HOST_LEAST_US), 0.5 * cycle_us)
 
 
 def bus_budget(axes: int, cycle_us: int, bit_rate: int, heartbeat_ms: int, sdo_frames_a_cycle: int) -> BusBudget:

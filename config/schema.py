@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
-from config.bus_budget import LATEST_TPDO, MAX_BUS_LOAD, BusBudget, bus_budget
+from config.bus_budget import MAX_BUS_LOAD, BusBudget, bus_budget, deadline_without_wire_us
 from config.emulation_section import EmulatedDriveSection
 from config.guard_section import GuardSection
 from config.model import AxisName, Model, Point, Positive
@@ -276,7 +276,7 @@ class GatewayConfig(Model):
     @property
     def tpdo_deadline_us(self) -> float:
         """How long after SYNC the TPDOs are waited for."""
-        return LATEST_TPDO * self.bus.cycle_us if self.bus.is_virtual else self.budget.tpdo_deadline_us
+        return deadline_without_wire_us(self.bus.cycle_us) if self.bus.is_virtual else self.budget.tpdo_deadline_us
 
     @property
     def wire_bit_rate(self) -> int:

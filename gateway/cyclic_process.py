@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from config.bus_budget import LATEST_TPDO
+from config.bus_budget import deadline_without_wire_us
 from config.loading import parse_config
 from config.schema import GatewayConfig
 from drivers.cia402 import COMMAND_QUICK_STOP
@@ -193,7 +193,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         time.thread_time_ns,
         job.is_homing_again,
         None if store is None else store.learning(),
-        None if has_wire(address) else LATEST_TPDO * config.bus.cycle_us,
+        None if has_wire(address) else deadline_without_wire_us(config.bus.cycle_us),
         job.machine_cycles if job.is_starting_anywhere else None,
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,7 +1,7 @@
 """Why a cycle was late: what the kernel knows of the time that the loop did not have.
 
-Two cheap reads a cycle (the thread's own figures), one dear one, /proc/stat, only after a late wake. What is found is
-collected, and told in a sentence at most once a second.
+One cheap read a cycle (the thread's own figures), two dear ones, of files in /proc, only after a late wake. What is
+found is collected, and told in a sentence at most once a second.
 """
 
 import os
@@ -49,6 +49,18 @@ def read_steal_ns(path: Path = Path("/proc/stat")) -> int | None:
         return None
 
 
+def read_waited_ns(path: Path = Path("/proc/thread-self/schedstat")) -> int | None:
+    """Time for which the calling thread was ready and had to wait for a processor; None where nobody tells."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return int(os.read(descriptor, _STAT_BYTES).split()[1])
+        finally:
+            os.close(descriptor)
+    except (OSError, ValueError, IndexError):
+        return None
+
+
 class LateWatch:
     """Notes late wakes and their causes; see ``gateway.cycle_host.LateWatch``."""
 
@@ -59,6 +71,7 @@ class LateWatch:
         *,
         thread: Callable[[], ThreadFigures] = read_thread,
         steal_ns: Callable[[], int | None] = read_steal_ns,
+        waited_ns: Callable[[], int | None] = read_waited_ns,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         """``tell`` gets a sentence about all late wakes since the last one, and their figures."""
@@ -66,11 +79,15 @@ class LateWatch:
         self._tell = tell
         self._thread = thread
         self._steal_ns = steal_ns
+        self._waited_ns = waited_ns
         self._clock = clock
         self._before = thread()
         self._steal_before_ns = steal_ns()
+        self._waited_before_ns = waited_ns()
         self._told_ns = clock() - TELL_EVERY_NS
         self._late = self._unexplained = self._switches = self._faults = self._stolen_ns = 0
+        self._queued_ns = 0
+        """Waiting for a processor, between late wakes too."""
         self._worst_ns = self._worst_cycle = 0
 
     def woke(self, cycle: int, lateness_ns: int) -> None:
@@ -89,6 +106,8 @@ class LateWatch:
         causes: list[str] = []
         if self._switches:
             causes.append(f"the processor taken away {self._switches} times")
+        if self._queued_ns:
+            causes.append(f"{self._queued_ns / 1000:.0f} us of waiting for a processor")
         if self._stolen_ns:
             causes.append(f"{self._stolen_ns / 1e6:.0f} ms stolen by the host")
         if self._faults:
@@ -101,13 +120,14 @@ class LateWatch:
             "unexplained": self._unexplained,
             "involuntary_switches": self._switches,
             "page_faults": self._faults,
+            "waited_us": self._queued_ns // 1000,
             "stolen_us": self._stolen_ns // 1000,
             "worst_us": self._worst_ns // 1000,
         }
         self._tell(text + ", ".join(causes), figures)
         self._told_ns = self._clock()
         self._late = self._unexplained = self._switches = self._faults = self._stolen_ns = 0
-        self._worst_ns = 0
+        self._worst_ns = self._queued_ns = 0
 
     def _note(self, cycle: int, lateness_ns: int, now: ThreadFigures) -> None:
         before = self._before
@@ -118,10 +138,17 @@ class LateWatch:
         if steal_ns is not None and self._steal_before_ns is not None:
             stolen_ns = steal_ns - self._steal_before_ns
         self._steal_before_ns = steal_ns
+        waited_ns = self._waited_ns()
+        if waited_ns is not None and self._waited_before_ns is not None:
+            queued_ns = waited_ns - self._waited_before_ns
+        else:
+            queued_ns = 0
+        self._waited_before_ns = waited_ns
+        self._queued_ns += queued_ns
         self._late += 1
         self._switches += switches
         self._faults += faults
         self._stolen_ns += stolen_ns
-        self._unexplained += not (switches or faults or stolen_ns)
+        self._unexplained += not (switches or faults or stolen_ns or queued_ns >= self._limit_ns)
         if lateness_ns > self._worst_ns:
             self._worst_ns, self._worst_cycle = lateness_ns, cycle

@@ -7,7 +7,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from config.bus_budget import bus_budget, representable_cycle_us
+from config.bus_budget import bus_budget, deadline_without_wire_us, representable_cycle_us
 from config.loading import ConfigError, load_config, parse_config
 from drivers.frame import Frame
 from gateway.bus_address import BusAddress
@@ -76,7 +76,8 @@ def test_a_cycle_of_600_us_is_too_full_for_a_real_bus():
 
 def test_a_cycle_of_600_us_is_allowed_where_frames_take_no_time_and_refused_on_a_real_bus(tmp_path):
     config = with_bus(cycle_us=600, is_virtual=True)
-    assert config.tpdo_deadline_us == 480.0
+    assert config.tpdo_deadline_us == 350.0
+    assert [deadline_without_wire_us(us) for us in (200, 500, 1000, 4000)] == [100.0, 250.0, 750.0, 3200.0]
     assert not budget_json(config)["is_within_bound"]
     (tmp_path / "devices" / "virtual" / "net" / "vcan0").mkdir(parents=True)
     (tmp_path / "devices" / "pci0" / "net" / "can0").mkdir(parents=True)

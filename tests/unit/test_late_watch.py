@@ -1,8 +1,10 @@
 """What is said of late cycles, with a kernel that is made up."""
 
+from pathlib import Path
+
 import pytest
 
-from gateway.late_watch import LateWatch, ThreadFigures, read_steal_ns, read_thread
+from gateway.late_watch import LateWatch, ThreadFigures, read_steal_ns, read_thread, read_waited_ns
 
 MS = 1_000_000
 
@@ -10,13 +12,14 @@ MS = 1_000_000
 class Kernel:
     def __init__(self):
         self.switches = self.minor = self.major = self.now_ns = self.stat_reads = 0
-        self.steal = 0
+        self.steal = self.waited = 0
         self.told = []
         self.watch = LateWatch(
             MS,
             lambda text, figures: self.told.append((text, figures)),
             thread=lambda: ThreadFigures(self.switches, self.minor, self.major),
             steal_ns=self.read,
+            waited_ns=lambda: self.waited,
             clock=lambda: self.now_ns,
         )
         self.stat_reads = 0
@@ -59,8 +62,24 @@ def test_each_late_wake_is_given_what_changed_in_its_own_cycle():
         "3 late wakes, the worst 900 us at cycle 4: 20 ms stolen by the host, 3 page faults, no cause"
     )
     assert figures == {
-        "late": 3, "unexplained": 1, "involuntary_switches": 0, "page_faults": 3, "stolen_us": 20_000, "worst_us": 900
+        "late": 3, "unexplained": 1, "involuntary_switches": 0, "page_faults": 3, "waited_us": 0, "stolen_us": 20_000,
+        "worst_us": 900,
     }  # fmt: skip
+
+
+def test_waiting_for_a_processor_explains_a_late_wake():
+    kernel = Kernel()
+    kernel.waited = 350_000
+    kernel.watch.woke(9, 360_000)
+    text, figures = kernel.told.pop()
+    assert text == "1 late wakes, the worst 360 us at cycle 9: 350 us of waiting for a processor"
+    assert (figures["waited_us"], figures["unexplained"]) == (350, 0)
+
+
+def test_this_kernel_tells_how_long_a_thread_waited():
+    waited_ns = read_waited_ns()
+    assert waited_ns is None or 0 <= waited_ns <= read_waited_ns()
+    assert read_waited_ns(Path("/nowhere")) is None
 
 
 @pytest.mark.parametrize(
