@@ -17,9 +17,13 @@ ON = (True, True)
 
 
 def compliant(
-    cv: Coupling | None, servo: Coupling | None, dynamics: DynamicsParameters | None = None, substeps: int = 4
+    cv: Coupling | None,
+    servo: Coupling | None,
+    dynamics: DynamicsParameters | None = None,
+    substeps: int = 4,
+    smoothing: float = 0.0,
 ) -> CompliantPlant:
-    axis = AxisDriveline(brake_torque_Nm=20.0)
+    axis = AxisDriveline(brake_torque_Nm=20.0, friction_smoothing_rad_per_s=smoothing)
     parameters = PlantParameters(dynamics or paper_dynamics(), compiled().closure, (axis, axis), substeps=substeps)
     return CompliantPlant(parameters, (cv, servo), 0.0, 0.0)
 
@@ -102,19 +106,20 @@ def test_play_lets_the_motor_turn_before_the_link_does() -> None:
 
 
 @pytest.mark.parametrize(
-    ("cv", "servo", "is_frictionless", "bound"),
+    ("cv", "servo", "smoothing", "is_frictionless", "bound"),
     [
-        (Coupling(1000.0, 0.02), Coupling(1000.0, 0.02), False, 2e-5),
-        (Coupling(1000.0, 0.02, 0.01), Coupling(1000.0, 0.02, 0.01), False, 2e-5),
-        (None, Coupling(800.0, 0.05), True, 1e-7),
-        (Coupling(800.0, 0.05, 0.005), None, True, 2e-5),
+        (Coupling(1000.0, 0.02), None, 0.5, False, 1e-6),
+        (Coupling(1000.0, 0.02), Coupling(1000.0, 0.02), 0.0, False, 2e-5),
+        (Coupling(1000.0, 0.02, 0.01), Coupling(1000.0, 0.02, 0.01), 0.0, False, 2e-5),
+        (None, Coupling(800.0, 0.05), 0.0, True, 1e-7),
+        (Coupling(800.0, 0.05, 0.005), None, 0.0, True, 2e-5),
     ],
-    ids=["flexible", "play", "one axis, frictionless", "play of the crank"],
+    ids=["smoothed friction", "flexible", "play", "one axis, frictionless", "play of the crank"],
 )
 def test_the_balance_of_energy_closes(
-    cv: Coupling | None, servo: Coupling | None, is_frictionless: bool, bound: float
+    cv: Coupling | None, servo: Coupling | None, smoothing: float, is_frictionless: bool, bound: float
 ) -> None:
-    plant = compliant(cv, servo, frictionless() if is_frictionless else None, substeps=16)
+    plant = compliant(cv, servo, frictionless() if is_frictionless else None, 16, smoothing)
     start = plant.energy()
     drive_on_the_cam(plant, 2 * PERIODS_IN_CYCLE, stiffness=5.0, damping=0.05)
     assert plant.torn_at_s is None

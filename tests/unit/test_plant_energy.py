@@ -63,6 +63,21 @@ def test_the_balance_of_the_coupled_machine_closes(
     assert abs(rest) < bound
 
 
+def test_a_machine_that_its_brakes_hold_does_and_loses_nothing() -> None:
+    plant = coupled(driveline=AxisDriveline(brake_torque_Nm=6.0))
+    start = plant.energy()
+    for _ in range(512):
+        plant.advance((0.9, -0.7), (True, True))
+    assert plant.state[:4] == (0.0, 0.0, 0.0, 0.0)
+    assert plant.energy() == start
+    for axis in (0, 1):
+        energy = plant.axis_energy(axis)
+        # Torques that move nothing do no work; what remains is third order in the step.
+        assert abs(energy.shaft) < 1e-6
+        assert abs(energy.dry_heat) < 1e-6
+        assert energy.copper > 1.0
+
+
 @pytest.mark.slow
 def test_a_hundred_frictionless_machine_cycles_keep_the_energy() -> None:
     plant = coupled(FRICTIONLESS)
