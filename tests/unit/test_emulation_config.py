@@ -6,8 +6,10 @@ import pytest
 
 from config.loading import ConfigError, load_config, parse_config
 from config.schema import SERVO_RATE_HZ, GatewayConfig
+from mechanism.errors import ParameterError
 from sim_drive import servo
 from sim_drive.assembly import build_machine
+from sim_drive.closed_loop import closed_loop_of
 from sim_drive.compliant import CompliantPlant
 from sim_drive.plant import CoupledPlant
 
@@ -119,6 +121,14 @@ def test_impossible_machines_are_refused_with_a_sentence(old: str, new: str, sen
         changed(old, new)
     (problem,) = refused.value.problems
     assert sentence in problem
+
+
+@pytest.mark.parametrize(
+    "line", ["coupling: {stiffness_Nm_per_rad: 500}", "resolver_eccentricity_counts: 3"], ids=["coupling", "eccentric"]
+)
+def test_the_fast_loop_refuses_what_it_does_not_have(line: str) -> None:
+    with pytest.raises(ParameterError, match=r"axes\.\*\.emulation\.\w+ is .* where the machine is simulated without"):
+        closed_loop_of(with_option(line))
 
 
 def test_more_steps_make_a_stiff_coupling_possible() -> None:
