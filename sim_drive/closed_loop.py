@@ -63,7 +63,6 @@ _CLOCK_COUNT: Final = 4
 _TICK_COLUMNS: Final = 5
 """Of a recorded servo tick, each axis: counts, demand in counts; torque command, torque and torque offset in N m."""
 
-_FOR_THE_KERNEL: Final = "where the machine is simulated without its bus"
 _AXES: Final = 2
 _NS_PER_S: Final = 1_000_000_000
 
@@ -488,16 +487,14 @@ def closed_loop_of(config: GatewayConfig, seed: int = 0) -> ClosedLoop:
     """The closed loop of the machine that `sim_drive.assembly.build_machine` builds from ``config``.
 
     Raises drivers.errors.EdsError or mechanism.errors.MechanismError; a ParameterError for a machine with flexible
-    couplings or eccentric resolvers, which this kernel does not have.
+    couplings, which this kernel does not have.
     """
     machine = build_machine(config)
     plant = machine.plant
     if not isinstance(plant, CoupledPlant):
-        raise ParameterError("axes.*.emulation.coupling", "given", f"null {_FOR_THE_KERNEL}")
-    for axis in machine.axes:
-        if axis.resolver_eccentricity_counts:
-            name = "axes.*.emulation.resolver_eccentricity_counts"
-            raise ParameterError(name, f"{axis.resolver_eccentricity_counts:g}", f"0 {_FOR_THE_KERNEL}")
+        raise ParameterError(
+            "axes.*.emulation.coupling", "given", "null where the machine is simulated without its bus"
+        )
     return ClosedLoop(
         plant=PlantArguments(*plant.kernel_arguments),
         axes=machine.axes,
