@@ -17,6 +17,7 @@ from synthesis_samples import (
     paper_task,
 )
 
+from mechanism.cam import CamLimits, compile_cam
 from mechanism.errors import ParameterError, SynthesisError
 from mechanism.synthesis.candidate import Candidate
 from mechanism.synthesis.crank_dyads import (
@@ -303,6 +304,23 @@ def test_free_timing_finds_a_mechanism() -> None:
     best.require_feasible()
     assert np.all(np.diff(best.curve().theta2) > 0.0)
     assert float(np.max(best.servo_motion().structural_error)) < 1e-6 * task.size_m
+
+
+@pytest.mark.parametrize("timing", list(Timing))
+def test_what_is_found_compiles_into_a_cam(timing: Timing) -> None:
+    """Under its real torque and transmission angle the paper's curve leads near the paper's links again."""
+    faults = (Term.MOBILITY, Term.SINGULARITY) + ((Term.TIMING,) if timing is Timing.FREE else ())
+    wanted = ((Term.STRUCTURAL_ERROR, 1.0), (Term.TRANSMISSION_ANGLE, 100.0), (Term.PEAK_TORQUE, 10.0))
+    terms = tuple(WeightedTerm(*pair) for pair in (*wanted, *((term, 1e4) for term in faults)))
+    task = replace(paper_task(), terms=terms, timing=timing)
+    best = last(search(task, Method.DIFFERENTIAL_EVOLUTION, 1, 10_000, report_every=1000)).best
+    best.require_feasible()
+    compile_cam(best.curve(), best.five_bar(), CamLimits(50.0, 5000.0, structural_error_m=5e-4), 6.0).require()
+    if timing is Timing.PRESCRIBED:
+        np.testing.assert_allclose(best.variables[:4], PAPER_LINKS[:4], atol=0.03)
+    links = evaluate(task, PAPER_LINKS)[0]
+    assert best.value(Term.TRANSMISSION_ANGLE) < links[1]
+    assert best.value(Term.PEAK_TORQUE) < links[2]
 
 
 def test_strings_decode_from_bound_to_bound() -> None:
