@@ -1,7 +1,7 @@
 """Differential evolution with a success history and a population that shrinks (L-SHADE; Tanabe and Fukunaga, 2014).
 
-Written here, because a search must be able to step, to be saved and to go on, none of which scipy's offers; it costs
-about as much between two evaluations as that one does.
+Written here, because a search must be able to step, to be saved and to go on, none of which scipy's offers, and because
+with kernels as fast as these the optimiser is what takes the time.
 """
 
 from typing import Any, Final
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanism.synthesis.crank_dyads import seeded_population
+from mechanism.synthesis.evolution_kernels import UNIFORM_DRAWS, make_trials
 from mechanism.synthesis.run import Run, Saved, Step, Steps, load_random, save_random
 from mechanism.synthesis.task import VARIABLE_COUNT
 
@@ -44,9 +45,7 @@ class _Evolution:
 
     def advance(self) -> None:
         """One generation."""
-        count = self.values.size
-        crossover, scale = self._parameters(count)
-        trial = self._trials(crossover, scale)
+        trial, crossover, scale = self._trials()
         _, values = self.run.ledger.evaluate(self.run.spread(trial))
         better = values < self.values
         gain = np.where(better, self.values - values, 0.0)
@@ -75,37 +74,24 @@ class _Evolution:
         self.unit, self.values = arrays["unit"], arrays["values"]
         self.archive, self.memory = arrays["archive"], arrays["memory"]
 
-    def _parameters(self, count: int) -> tuple[Float, Float]:
-        """Crossover rates and scale factors around what has worked; a rate below 0 in the memory means 0 for good."""
-        slots = self.random.integers(0, _MEMORY, count)
-        middle = self.memory[0, slots]
-        crossover = np.clip(self.random.normal(np.maximum(middle, 0.0), 0.1), 0.0, 1.0)
-        crossover[middle < 0.0] = 0.0
-        # Cauchy around the memory's scale; what falls below 0 is taken again in the original, mirrored here.
-        scale = np.abs(self.memory[1, slots] + 0.1 * self.random.standard_cauchy(count))
-        return crossover, np.clip(scale, 1e-3, 1.0)
-
-    def _trials(self, crossover: Float, scale: Float) -> Float:
-        """Current-to-best-few mutation and binomial crossover, kept inside the bounds, (m, 8) in the unit cube."""
+    def _trials(self) -> tuple[Float, Float, Float]:
+        """Trials (m, 8) in the unit cube, and the crossover rates and scale factors that made them."""
         count = self.values.size
-        order = np.argsort(self.values, kind="stable")
-        few = max(round(_GREEDY_SHARE * count), 2)
-        best = self.unit[order[self.random.integers(0, few, count)]]
-        every = np.arange(count)
-        first = self.random.integers(0, count - 1, count)
-        first += first >= every
-        pool = np.concatenate((self.unit, self.archive))
-        second = self.random.integers(0, pool.shape[0] - 2, count)
-        low, high = np.minimum(every, first), np.maximum(every, first)
-        second += second >= low
-        second += second >= high
-        factor = scale[:, np.newaxis]
-        mutant = self.unit + factor * (best - self.unit) + factor * (self.unit[first] - pool[second])
-        mutant = np.where(mutant < 0.0, 0.5 * self.unit, mutant)
-        mutant = np.where(mutant > 1.0, 0.5 * (1.0 + self.unit), mutant)
-        take = self.random.random(mutant.shape) < crossover[:, np.newaxis]
-        take[every, self.random.integers(0, VARIABLE_COUNT, count)] = True
-        return np.where(take, mutant, self.unit)
+        trials, crossover, scale = np.empty_like(self.unit), np.empty(count), np.empty(count)
+        make_trials(
+            self.unit,
+            np.argsort(self.values, kind="stable"),
+            self.archive,
+            self.memory,
+            self.random.random((count, UNIFORM_DRAWS)),
+            self.random.standard_normal(count),
+            self.random.standard_cauchy(count),
+            _GREEDY_SHARE,
+            trials,
+            crossover,
+            scale,
+        )
+        return trials, crossover, scale
 
     def _remember(self, crossover: Float, scale: Float, gain: Float) -> None:
         """Put the gain-weighted Lehmer means of what worked into the memory."""

@@ -27,6 +27,7 @@ from mechanism.synthesis.crank_dyads import (
     seeded_population,
     suitable_cranks,
 )
+from mechanism.synthesis.evolution_kernels import UNIFORM_DRAWS, make_trials
 from mechanism.synthesis.genetic_kernels import BITS, DRAWS, STRING, breed, decode, scale_fitness
 from mechanism.synthesis.ledger import Ledger
 from mechanism.synthesis.objective import evaluate, weighted_sum
@@ -371,6 +372,34 @@ def test_children_are_cut_and_flipped_where_the_draws_say() -> None:
     breed(codes, fitness, draws, 0.85, 0.03, children)
     assert children[0].tolist() == [ones] * 3 + [ones - 1] + [ones] * 4
     assert children[1].tolist() == [zeros] * 7 + [2**9]
+
+
+def test_trials_are_made_as_the_draws_say() -> None:
+    """Three members and one archived: best, partners, rate and scale are those of the draws, worked out by hand."""
+    unit = np.array([[0.2] * 8, [0.4] * 8, [0.9] * 8])
+    archive = np.array([[0.5] * 8])
+    memory = np.array([[0.5, -1.0], [0.5, 0.5]])
+    uniform = np.full((3, UNIFORM_DRAWS), 0.999)
+    # Member 0: slot 0 (rate 0.5), best of two is the first of the order (2), partner 1 (the first that is not itself),
+    # second partner the last of the pool, which is the archive; the sure variable is the last, the first is taken too.
+    uniform[0, :4] = 0.0, 0.0, 0.0, 0.999
+    uniform[0, 5] = 0.49
+    # Member 1: slot 1, whose rate is 0 for good; best is the other of two (0), partner 2, second the other member, 0.
+    uniform[1, :5] = 0.999, 0.999, 0.999, 0.0, 0.0
+    trials, rates, scales = np.empty((3, 8)), np.empty(3), np.empty(3)
+    order = np.array([2, 0, 1])
+    make_trials(
+        unit, order, archive, memory, uniform, np.zeros(3), np.array([0.0, -9.0, 99.0]), 0.7, trials, rates, scales
+    )
+    np.testing.assert_allclose(rates, [0.5, 0.0, 0.0])
+    np.testing.assert_allclose(scales, [0.5, 0.4, 1.0])
+    # 0.2 + 0.5 (0.9 - 0.2) + 0.5 (0.4 - 0.5) = 0.5
+    np.testing.assert_allclose(trials[0], [0.5] + [0.2] * 6 + [0.5])
+    # 0.4 + 0.4 (0.2 - 0.4) + 0.4 (0.9 - 0.2) = 0.6
+    np.testing.assert_allclose(trials[1], [0.6] + [0.4] * 7)
+    # Member 2: best 0, partner 1, second 3 (archive): 0.9 - 0.7 - 0.1 = 0.1.
+    np.testing.assert_allclose(trials[2], [0.9] * 7 + [0.1])
+    assert np.all((trials >= 0.0) & (trials <= 1.0))
 
 
 def test_the_shipped_curve_is_the_papers() -> None:
