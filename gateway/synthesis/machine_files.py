@@ -15,11 +15,13 @@ import yaml
 from numpy.typing import NDArray
 
 from config.conversion import dynamics_parameters, five_bar
-from config.loading import parse_config
+from config.loading import ConfigError, parse_config
 from config.schema import GatewayConfig, LinkSection
 from gateway.errors import GatewayError
 from gateway.preparation import PreparedRun, compile_config, prepare
 from mechanism.cam import Cam
+from mechanism.cam_profile import CamProfile
+from mechanism.closure import ClosureTrack
 from mechanism.curve import DesiredCurve
 from mechanism.curve_points import curve_csv
 from mechanism.dynamics import mass_matrix_and_bias
@@ -38,6 +40,7 @@ _ROUNDS: Final = 8
 _GAINS_KEPT: Final = 0.05
 """A change of inertia by less is no reason to change gains."""
 _INERTIA_SAMPLES: Final = 72
+_RANGE_SAMPLES: Final = 4097
 _LINKS: Final = ("p", "q", "r", "s")
 
 Float = NDArray[np.float64]
@@ -103,8 +106,8 @@ def write_machine(
     curve_path.write_text(curve_csv(curve), encoding="utf-8")
     document = _document(path, curve_path, candidate, curve, template)
     notes: list[str] = []
+    _settle_home_and_range(document, candidate.servo_motion(), template)
     config, prepared = _prepared(document, path, remark)
-    _settle_home_and_range(document, prepared)
     notes += _settle_gains(document, prepared, template)
     for _ in range(_ROUNDS):
         config, prepared = _prepared(document, path, remark)
@@ -166,21 +169,29 @@ def _slave(document: Document) -> Document:
 def _prepared(document: Document, path: Path, remark: str) -> tuple[GatewayConfig, PreparedRun]:
     comment = "".join(f"# {line}\n" for line in remark.splitlines())
     text = comment + yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=120, allow_unicode=True)
-    config = parse_config(text, path)
+    try:
+        config = parse_config(text, path)
+    except ConfigError as error:
+        # The template was sound: it is the mechanism that makes no machine.
+        raise GatewayError(f"the mechanism found makes no machine: {error}") from None
     return config, prepare(config, is_strict=False)
 
 
-def _settle_home_and_range(document: Document, prepared: PreparedRun) -> None:
+def _settle_home_and_range(document: Document, track: ClosureTrack, template: GatewayConfig) -> None:
     """The servo axis' home is where the cam has it when the master is at home; its range is what the cam sweeps."""
-    report, slave = prepared.cam.report, _slave(document)
-    home = radians(prepared.config.ordered_axes[0].home_angle_deg)
-    slave["home_angle_deg"] = round(degrees(prepared.cam.profile.at(home)[0]), 6) + 0.0
+    profile = CamProfile.through(track.theta2, track.theta5, track.net_turns, template.motion.cam_points)
+    slave = _slave(document)
+    home = radians(template.ordered_axes[0].home_angle_deg)
+    slave["home_angle_deg"] = round(degrees(profile.at(home)[0]), 6) + 0.0
     limits = slave["limits"]
-    if report.net_turns:
+    if track.net_turns:
         limits.pop("position_deg", None)
         return
-    low, high = degrees(report.position_minimum.value), degrees(report.position_maximum.value)
-    limits["position_deg"] = [round(low - _RANGE_MARGIN_DEG, 1), round(high + _RANGE_MARGIN_DEG, 1)]
+    swept = np.degrees(profile.at_many(np.linspace(0.0, tau, _RANGE_SAMPLES))[:, 0])
+    limits["position_deg"] = [
+        round(float(swept.min()) - _RANGE_MARGIN_DEG, 1),
+        round(float(swept.max()) + _RANGE_MARGIN_DEG, 1),
+    ]
 
 
 def _settle_gains(document: Document, prepared: PreparedRun, template: GatewayConfig) -> list[str]:
