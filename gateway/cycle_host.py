@@ -88,6 +88,7 @@ class CycleHost:
         self._backlog: list[Frame] = []
         self._errors: SocketcanPort | None = cyclic if isinstance(cyclic, SocketcanPort) else None
         self._error_count = 0
+        self._polled_cycle: int = -1
         self.phase_ns = 0
         """When after SYNC the loop wakes; 0 while it is not known."""
         core.loop.is_paced = sync is not None
@@ -149,6 +150,7 @@ class CycleHost:
         self._switch_sync()
         self._follow_cycle()
         # A loop that is always late never waits, and must hear of a stop all the same.
+        self._polled_cycle = loop.cycle
         self._poll()
 
     def _switch_sync(self) -> None:
@@ -172,9 +174,11 @@ class CycleHost:
 
     def _rest(self, now_ns: int, due_ns: int) -> None:
         """Sleep until the core is due, the loop's phase has come, or a frame is there."""
-        self._poll()
         self._switch_sync()
         loop = self._core.loop
+        if not loop.is_running or loop.cycle != self._polled_cycle:
+            self._polled_cycle = loop.cycle
+            self._poll()
         if self._backlog:
             self._wait(min(due_ns - now_ns, RETRY_NS))
             self._send([])

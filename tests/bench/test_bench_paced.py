@@ -222,12 +222,27 @@ def canopen_us() -> float:
     return spent_us
 
 
+@contextmanager
+def real_time_priority() -> Iterator[str]:
+    """For all alike, the responder's process included; on a busy computer nothing else can be compared."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except PermissionError:
+        yield "without real-time priority"
+        return
+    try:
+        yield "SCHED_FIFO"
+    finally:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+
+
 def test_paced_at_one_kilohertz(calls: tuple[list[Call], int]) -> None:
     print()
     tighten_timers()
-    rounds = [(gateway_us(*calls)[0], bare_us(), canopen_us()) for _ in range(ROUNDS)]
+    with real_time_priority() as how:
+        rounds = [(gateway_us(*calls)[0], bare_us(), canopen_us()) for _ in range(ROUNDS)]
     ours, floor, package = map(min, zip(*rounds, strict=True))
     print(
-        f"1 kHz over loopback, two axes: gateway {ours:.1f} us of CPU a cycle, bare loop {floor:.1f}, canopen package "
-        f"{package:.1f}; gateway : bare {ours / floor:.2f}, gateway : canopen {ours / package:.2f}"
+        f"1 kHz over loopback, two axes, {how}: gateway {ours:.1f} us of CPU a cycle, bare loop {floor:.1f}, "
+        f"canopen package {package:.1f}; gateway : bare {ours / floor:.2f}, gateway : canopen {ours / package:.2f}"
     )

@@ -76,7 +76,7 @@ class LateCore:
     """A core that is due for ever, as one on an overloaded host; ends after so many wakes."""
 
     is_running = is_closed = is_paced = False
-    arrival_offset_ns = sync_due_ns = 0
+    arrival_offset_ns = sync_due_ns = cycle = 0
 
     def __init__(self, wakes):
         self.left = wakes
