@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.cycle_errors import CycleErrors, cycle_errors
 from gateway.histograms import CycleCounts, CycleHistograms, Timing, count_cycles
 from gateway.paper_reference import TABLE_II, PrecisionPoint, is_reference_machine
 from gateway.recording import CAM_ATTACHMENT, Recording, RecordingError
@@ -157,6 +158,7 @@ class RunReport:
     steady: PhaseFigures
     whole_run: PhaseFigures
     cycle: CycleFigures
+    by_machine_cycle: CycleErrors
     phase_counts: dict[Phase, int]
     table_ii: tuple[PointFigures, ...]
     """Empty unless the machine is the paper's."""
@@ -174,6 +176,7 @@ class RunReport:
             **_phase_json(self.steady, self.constants),
             "cycle": _cycle_json(self.cycle),
             "machine_cycles": self.machine_cycles,
+            "by_machine_cycle": self.by_machine_cycle.to_json(self.constants.axis_names),
             "phases": {phase.name.lower(): count for phase, count in self.phase_counts.items()},
             "table_ii": [_point_json(row) for row in self.table_ii],
             "whole_run": _phase_json(self.whole_run, self.constants),
@@ -293,6 +296,7 @@ def report_of(
         steady=phase_figures(data, data.is_steady),
         whole_run=phase_figures(data, data.is_following),
         cycle=cycle_figures(data),
+        by_machine_cycle=cycle_errors(data),
         phase_counts={phase: int(np.count_nonzero(data.phase == phase)) for phase in Phase},
         table_ii=tuple(_point_figures(data, TABLE_II)) if is_reference_machine(data.constants.mechanism) else (),
         machine_cycles=_machine_cycles(data),

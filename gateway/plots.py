@@ -10,6 +10,7 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from gateway.analysis import BoolArray, FloatArray, RunData
+from gateway.cycle_errors import cycle_errors
 from gateway.figure import Axes, Figure, Theme, headroom, legend, new_figure, over_the_cycle, render_png, render_svg
 from gateway.paper_reference import TABLE_II, is_reference_machine
 
@@ -317,6 +318,25 @@ def _run(data: RunData, theme: Theme) -> Figure:
     return figure
 
 
+def _by_cycle(data: RunData, theme: Theme) -> Figure:
+    figure = new_figure(8.6, 3.2)
+    axes = figure.subplots()
+    errors = cycle_errors(data)
+    numbers = np.arange(1, errors.count + 1, dtype=np.float64)
+    for axis in (data.constants.slave_axis, data.constants.master_axis):
+        colour = theme.cv if axis == data.constants.master_axis else theme.servo
+        name = data.constants.axes[axis].name
+        style = "-" if errors.count > _MAX_OVERLAID else "o-"
+        axes.plot(numbers, errors.peak[:, axis], style, color=colour, lw=1.2, ms=4, label=f"{name}, greatest")
+        axes.plot(numbers, errors.rms[:, axis], color=colour, lw=1.2, ls=(0, (5, 3)), label=f"{name}, RMS")
+    axes.set_xlabel("machine cycle at constant speed")
+    axes.set_ylabel("following error (counts)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(0, axes.get_ylim()[1] * 1.25 or 1.0)
+    legend(axes, theme, loc="upper right", ncols=4)
+    return figure
+
+
 def plots_of(data: RunData) -> tuple[Plot, ...]:
     """The figures that this run's data allow, in the order of the report."""
     servo = data.constants.axes[data.constants.slave_axis].name
@@ -347,6 +367,12 @@ def plots_of(data: RunData) -> tuple[Plot, ...]:
         ),
         *((path,) if data.constants.mechanism is not None else ()),
         Plot("torque", "Torque over the machine cycle", "Actual torque as the drives report it.", _torque),
+        Plot(
+            "cycles",
+            "Following error by machine cycle",
+            "Each whole revolution at constant master speed: what learning takes away from one to the next.",
+            _by_cycle,
+        ),
         Plot(
             "run",
             "The whole run",

@@ -60,7 +60,7 @@ def render_page(recording: Recording, data: RunData, report: RunReport, plots: t
         servo=figures["servo"] + figures["cv"],
         path=figures.get("path", "") + _table_ii(report),
         torque=figures["torque"],
-        run=_whole_run_table(report) + figures["run"],
+        run=_whole_run_table(report) + figures["run"] + figures["cycles"],
         timing=_cycle_table(report) + figures["timing"],
         events=_events(recording),
         about=_about(recording, report),

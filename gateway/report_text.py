@@ -189,6 +189,8 @@ def render_report(report: RunReport) -> RenderableType:
         axes.add_row(row.what, row.unit, *row.ours, *(row.paper if is_reference else ()))
     parts.append(axes)
     parts.append(_whole_run_table(report))
+    if report.by_machine_cycle.count > 1:
+        parts.append(_by_cycle_table(report))
     parts.append(_end_effector(report))
     if report.table_ii:
         parts.append(_table_ii(report))
@@ -217,6 +219,19 @@ def _whole_run_table(report: RunReport) -> Table:
     extremes = [f"{number(e.max, sign=True)} / {number(e.min, sign=True)}" for e in errors]
     table.add_row("error, max / min", "counts", *extremes)
     table.add_row("error, RMS", "counts", *(number(e.rms, 1) for e in errors))
+    return table
+
+
+def _by_cycle_table(report: RunReport) -> Table:
+    errors = report.by_machine_cycle
+    table = _table("Error by machine cycle, greatest / RMS, counts")
+    table.add_column("")
+    shown = errors.shown()
+    for cycle in shown:
+        table.add_column(number(cycle), justify="right")
+    for axis, name in enumerate(report.constants.axis_names):
+        peak, rms = errors.peak[:, axis].tolist(), errors.rms[:, axis].tolist()
+        table.add_row(name, *(f"{number(peak[cycle - 1])} / {number(rms[cycle - 1], 1)}" for cycle in shown))
     return table
 
 

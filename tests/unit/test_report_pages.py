@@ -63,7 +63,7 @@ def test_the_report_is_a_page_of_its_own_with_figures_and_json(tmp_path: Path) -
     written = write_report(source, tmp_path / "out" / "report")
     names = [path.name for path in written]
     assert names[:2] == ["report.html", "report.json"]
-    assert {"servo.png", "cv.png", "path.png", "torque.png", "run.png", "timing.png"} == set(names[2:])
+    assert {"servo.png", "cv.png", "path.png", "torque.png", "cycles.png", "run.png", "timing.png"} == set(names[2:])
     for path in written[2:]:
         assert path.read_bytes().startswith(b"\x89PNG\r\n\x1a\n")
     assert json.loads(written[1].read_text()) == analyse(read_recording(source)).to_json()
@@ -71,7 +71,7 @@ def test_the_report_is_a_page_of_its_own_with_figures_and_json(tmp_path: Path) -
     page = _Page()
     page.feed(html)
     assert page.loaded == []
-    assert page.tags.count("svg") == 6
+    assert page.tags.count("svg") == 7
     assert "script" not in page.tags
     assert len(page.ids) == len(set(page.ids))
     text = " ".join(page.text)
