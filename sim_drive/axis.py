@@ -31,7 +31,7 @@ from sim_drive.cia402 import (
 from sim_drive.dictionary import Entry, LiveDictionary
 from sim_drive.emcy import AxisErrors, EmergencyCode, ErrorRegister
 from sim_drive.measured import MeasuredMotion
-from sim_drive.modes.base import OperationMode
+from sim_drive.modes.base import Holding, OperationMode
 from sim_drive.modes.camming import Camming
 from sim_drive.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
 from sim_drive.modes.homing import Homing, HomingStatus
@@ -169,7 +169,7 @@ class Axis(MeasuredMotion):
 
         self._homing = Homing(self)
         self._modes: dict[Mode, OperationMode] = {
-            Mode.NONE: OperationMode(self),
+            Mode.NONE: Holding(self),
             Mode.HOMING: self._homing,
             Mode.PROFILE_POSITION: ProfilePosition(self),
             Mode.PROFILE_VELOCITY: ProfileVelocity(self),

@@ -8,7 +8,7 @@ from sim_drive.motion import Motion
 class OperationMode:
     """A mode of operation. It is *active* between ``enter`` and ``leave``: selected, and Operation enabled.
 
-    The base does nothing in every respect: it is the mode 0, in which the axis holds its position.
+    The base does nothing in every respect.
     """
 
     __slots__ = ("is_active", "motion")
@@ -56,3 +56,14 @@ class OperationMode:
 
     def resume(self, now_ns: int) -> None:
         """Controlword bit 8 has been cleared while the mode is active."""
+
+
+class Holding(OperationMode):
+    """Mode 0, no mode: the axis comes to rest, and holds its position."""
+
+    __slots__ = ()
+
+    def enter(self, now_ns: int) -> None:
+        """End whatever motion there is."""
+        self.is_active = True
+        self.motion.slow_down(now_ns)

@@ -184,3 +184,14 @@ def test_a_cam_that_went_on_during_a_halt_is_a_jump():
     moving.go_on(3)
     assert abs(moving.bench.shaft - stood) <= 1
     assert moving.bench.read(0x603F) == 0xFF21
+
+
+@pytest.mark.parametrize("mode", [1, 3, 9])
+def test_without_a_mode_the_axis_comes_to_rest(mode: int):
+    moving = Moving(mode)
+    moving.bench.must(0x6060, 0, 0, 1)
+    moving.bench.run(30 * MS)
+    stood = moving.bench.shaft
+    moving.bench.run(100 * MS)
+    assert moving.bench.shaft == stood
+    assert moving.bench.drive.power_state is PowerState.OPERATION_ENABLED
