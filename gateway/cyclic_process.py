@@ -37,6 +37,8 @@ from gateway.event_text import describe
 from gateway.guard import Condition, StopReason
 from gateway.late_watch import LateWatch
 from gateway.learning_store import LearningStore, open_store
+from gateway.operation import Order
+from gateway.order_word import unpack_order
 from gateway.preparation import build_core, plan
 from gateway.ring import RingWriter, RunState, StopRequest
 from mechanism.cam_file import parse_cam_file
@@ -88,6 +90,7 @@ def refuse_other_master(port: Port, gateway_node_id: int, span_s: float) -> None
             raise GatewayError(f"somebody else commands this bus: {sign} is on it, is another run going on?")
 
 
+ORDERS: Final = frozenset(int(order) for order in Order)
 WISH_OF_REQUEST: Final = {
     StopRequest.CONTROLLED_STOP: Condition.OPERATOR_STOP,
     StopRequest.SIGINT: Condition.SIGINT,
@@ -107,6 +110,14 @@ def pass_on_stop(core: GatewayCore, request: int, answered: int) -> int:
     else:
         core.request_stop(WISH_OF_REQUEST[StopRequest(request)])
     return request
+
+
+def pass_on_order(core: GatewayCore, word: int) -> int:
+    """Hand an operator's order to the core; a word that is none passes. Returns the word."""
+    _, order, value = unpack_order(word)
+    if order in ORDERS:
+        core.order(Order(order), value)
+    return word
 
 
 def stop_drives(core: GatewayCore, port: Port) -> None:
@@ -205,17 +216,20 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     signal.signal(signal.SIGHUP, on_terminate)
     end_with(job.parent_pid)
     answered = int(StopRequest.NONE)
+    ordered = 0
 
     def on_event(event: Event) -> None:
         kind, text, data = describe(event)
         ring.append_event(event.at_ns, kind, text, source="gateway", **data)
 
     def poll() -> None:
-        nonlocal answered
+        nonlocal answered, ordered
         for event in core.take_events():
             on_event(event)
         ring.beat(time.monotonic_ns())
         answered = pass_on_stop(core, ring.stop_request(), answered)
+        if ring.order_word() != ordered:
+            ordered = pass_on_order(core, ring.order_word())
 
     bus: CycleBus | None = None
     stopped_by = StopReason.BUS_LOST

@@ -28,6 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.errors import GatewayError
+from gateway.order_word import pack_order, unpack_order
 from gateway.run_constants import RunConstants
 from gateway.sample import SampleArray, SampleLayout
 
@@ -62,10 +63,10 @@ _EVENT_LENGTH: Final = struct.Struct("<I")
 _FIXED: Final = struct.Struct("<8s8I")
 _JSON_OFFSET: Final = 256
 _JSON_MAX: Final = HEADER_SIZE - _JSON_OFFSET
-# Words of 64 bits from byte 64 on, each with one writer, the stop request apart
+# Words of 64 bits from byte 64 on, each with one writer, the stop request and the operator's order apart
 _WORDS_OFFSET: Final = 64
 _WORD_COUNT: Final = 16
-_PID, _PID_START, _SAMPLES, _FRAMES, _EVENTS, _STATE, _RESULT, _HEARTBEAT, _STOP = range(9)
+_PID, _PID_START, _SAMPLES, _FRAMES, _EVENTS, _STATE, _RESULT, _HEARTBEAT, _STOP, _ORDER = range(10)
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
@@ -314,6 +315,10 @@ class RingWriter:
         """What the readers ask for, as the value of a ``StopRequest`` (an int, because the loop asks every cycle)."""
         return self._words[_STOP]
 
+    def order_word(self) -> int:
+        """The last order of an operator, see ``gateway.order_word``; 0 while there has been none."""
+        return self._words[_ORDER]
+
     def request_stop(self, request: StopRequest) -> None:
         """Ask for a stop from the writer's own process (a signal handler)."""
         _request_stop(self._words, request)
@@ -425,6 +430,11 @@ class RingReader:
     def is_over(self) -> bool:
         """Whether nothing more will be written: the run is finished or failed, or its process is gone."""
         return self.state in (RunState.FINISHED, RunState.FAILED) or not self.writer_is_alive()
+
+    def send_order(self, order: int, value: float) -> None:
+        """Give the loop an operator's order in place of the last one. Raises ValueError for a value too large."""
+        number, _, _ = unpack_order(self._words[_ORDER])
+        self._words[_ORDER] = pack_order(number + 1, order, value)
 
     def request_stop(self, request: StopRequest) -> None:
         """Ask the loop to stop."""

@@ -7,6 +7,7 @@ import typer
 
 from gateway.cli.animation_command import ANIMATE_EPILOG, animate
 from gateway.cli.cam_commands import CHECK_EPILOG, COMPILE_EPILOG, DOWNLOAD_EPILOG, check, compile_command, download
+from gateway.cli.control_commands import CONTROL_EPILOG, control
 from gateway.cli.doctor_command import DOCTOR_EPILOG, doctor
 from gateway.cli.run_commands import DEMO_EPILOG, RUN_EPILOG, demo, run
 from gateway.cli.synthesis_commands import SYNTHESIZE_EPILOG, synthesize
@@ -31,6 +32,7 @@ app.command("animate", epilog=ANIMATE_EPILOG)(animate)
 app.command("doctor", epilog=DOCTOR_EPILOG)(doctor)
 app.command("tune", epilog=TUNE_EPILOG)(tune)
 app.command("monitor", epilog=MONITOR_EPILOG)(monitor_command)
+app.command("control", epilog=CONTROL_EPILOG)(control)
 
 
 def _show_version(is_asked: bool) -> None:
