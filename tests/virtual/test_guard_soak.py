@@ -1,6 +1,6 @@
 """Hours of machine time with random faults: every stop within its bound, no exception, no leak.
 
-``DRIVE_GATEWAY_SOAK_HOURS`` sets the machine hours (default 0.06, some forty seconds of processor time).
+``DRIVE_GATEWAY_SOAK_HOURS`` sets the machine hours (default 0.1, some thirty seconds of processor time).
 """
 
 import gc
@@ -21,7 +21,7 @@ from sim_drive.assembly import build_machine
 from sim_drive.faults import Direction, Fault, FaultKind
 from sim_drive.injector import Injector
 
-HOURS = float(os.environ.get("DRIVE_GATEWAY_SOAK_HOURS", "0.06"))
+HOURS = float(os.environ.get("DRIVE_GATEWAY_SOAK_HOURS", "0.1"))
 LASTING = (FaultKind.FROZEN_RESOLVER,)
 STOP_BOUND_S = 2.5
 """From the first trip to drives without torque: a controlled stop at 60 rpm takes 1.4 s, settling and disabling 0.7."""
@@ -109,6 +109,19 @@ class Soak:
         assert any(isinstance(event, AxisRecovered) for event in events), faults
 
 
+def kept_by(soak, seed):
+    """Bytes that three sessions leave behind; tracing costs so much that the others go without."""
+    gc.collect()
+    tracemalloc.start()
+    try:
+        for more in range(3):
+            soak.session(seed + more)
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(0)
 def test_a_soak_with_random_faults():
@@ -116,26 +129,23 @@ def test_a_soak_with_random_faults():
     for seed in range(3):
         soak.session(seed)
     gc.collect()
-    tracemalloc.start()
-    try:
-        objects, seed, started = len(gc.get_objects()), 3, time.process_time()
-        while soak.machine_s < HOURS * 3600.0:
-            soak.session(seed)
-            seed += 1
-        gc.collect()
-        kept = tracemalloc.get_traced_memory()[0]
-    finally:
-        tracemalloc.stop()
+    objects, seed, started = len(gc.get_objects()), 3, time.process_time()
+    before_s = soak.machine_s
+    while soak.machine_s < HOURS * 3600.0:
+        soak.session(seed)
+        seed += 1
     spent_s = time.process_time() - started
+    per_hour_s = spent_s / max(soak.machine_s - before_s, 1.0) * 3600.0
+    kept = kept_by(soak, seed)
     counted = ", ".join(
         f"{reason.value} {count}" for reason, count in sorted(soak.reasons.items(), key=lambda r: -r[1])
     )
     print(
         f"\n{soak.machine_s / 3600.0:.3f} machine hours in {soak.sessions} sessions, {spent_s:.0f} s of processor time "
-        f"({24.0 * 3600.0 / soak.machine_s * spent_s / 3600.0:.1f} h for 24); longest stop {soak.worst_stop_s:.2f} s, "
+        f"({24.0 * per_hour_s / 3600.0:.1f} h for 24); longest stop {soak.worst_stop_s:.2f} s, "
         f"least sine {soak.least_sine:.2f}, {kept / 1024:.0f} KiB kept; {counted}"
     )
     assert len(gc.get_objects()) - objects < 2000
-    assert kept < 1_000_000
+    assert kept < 500_000
     assert StopReason.COMPLETED in soak.reasons
-    assert len(soak.reasons) >= 5
+    assert len(soak.reasons) >= min(5, soak.sessions // 6)
