@@ -33,15 +33,20 @@ def paper_demo(
     """
     from config.gain_sets import load_gain_sets
     from gateway.paper_comparison import compare, to_markdown, to_table
+    from gateway.paper_plot import plot_reproduction
 
     console = messages()
     runs: list[TunedRun] = []
+    shown: list[tuple[str, ServoTicks, slice]] = []
     for name, gains in load_gain_sets("paper").items():
         console.print(f"{gains.title}: {cycles} machine cycles in virtual time", markup=False)
-        runs.append(_run_tuning(config, name, gains, cycles, output / f"paper-{name}.mcap", seed, run))
+        tuned, ticks, last_cycle = _run_tuning(config, name, gains, cycles, output / f"paper-{name}.mcap", seed, run)
+        runs.append(tuned)
+        shown.append((f"{name}: {gains.title}", ticks, last_cycle))
     names = [own.name for own in runs]
     rows = compare(runs, _required_torque(config))
     (output / "paper.md").write_text(to_markdown(rows, names), encoding="utf-8")
+    (output / "paper.png").write_bytes(plot_reproduction(shown))
     document: dict[str, Any] = {
         "tunings": {own.name: own.to_json() for own in runs},
         "comparison": [row.to_json(names) for row in rows],
@@ -54,12 +59,13 @@ def paper_demo(
     for own in runs:
         gains_text = "; ".join(f"{axis} {','.join(map(str, values.values()))}" for axis, values in own.gains.items())
         results().print(f"{own.name}: {own.note} (K_P,K_I,K_D,K_V,K_F: {gains_text})", markup=False)
-    console.print(f"written: {output / 'paper.md'}, {output / 'paper.json'}", soft_wrap=True, markup=False)
+    console.print(f"written: paper.md, paper.json and paper.png in {output}", soft_wrap=True, markup=False)
 
 
 def _run_tuning(
     config: "GatewayConfig", name: str, gains: "GainSet", cycles: int, recording: Path, seed: int, run: VirtualRunner
-) -> "TunedRun":
+) -> "tuple[TunedRun, ServoTicks, slice]":
+    """A tuning's figures, its servo ticks, and which of them are the last machine cycle at full speed."""
     from config.gain_sets import with_gain_set
     from gateway.errors import GatewayError
     from gateway.paper_comparison import TunedRun
@@ -84,7 +90,7 @@ def _run_tuning(
     if ticks.revolutions[-1] < last:
         raise GatewayError(f"the run with the gains {name!r} was stopped early, see the events in {recording}")
     window = ticks.between(float(first), float(last))
-    return TunedRun(
+    run_figures = TunedRun(
         name=name,
         title=gains.title,
         note=gains.note,
@@ -93,6 +99,7 @@ def _run_tuning(
         ramped=_first_cycle(ticks),
         at_once=_first_cycle(_started_at_once(tuned, prepared)),
     )
+    return run_figures, ticks, ticks.between(float(last - 1), float(last))
 
 
 def _ticks_of(machine: "EmulatedMachine", counts_per_revolution: int) -> "ServoTicks":

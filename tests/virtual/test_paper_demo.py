@@ -35,6 +35,7 @@ def reproduced(tmp_path_factory):
     finally:
         sys.argv = arguments
     assert end.value.code == 0
+    assert (folder / "paper.png").read_bytes().startswith(b"\x89PNG")
     return json.loads((folder / "paper.json").read_text()), (folder / "paper.md").read_text()
 
 
