@@ -1,7 +1,8 @@
 """The paper's global search: its genetic algorithm, with its parameters (section 2.2.4).
 
-The paper leaves open how a mechanism is written down as a string; ten bits a variable are taken, whose step of about a
-millimetre suits the whole millimetres of its result.
+The paper leaves open how a mechanism is written down as a string, what its fitness is, and how far the search ranges.
+Ten bits a variable are taken, whose step of about a millimetre suits the whole millimetres of its result, and the
+reciprocal of the objective; one place to cut a string in, and every bit flips with the mutation rate.
 """
 
 from typing import Any, Final

@@ -41,7 +41,8 @@ class Term(Enum):
 
     The first four are the paper's, eqs (1) to (4) with the slips put right. Its units are not given; lengths in mm and
     angles in degrees are taken, because only with angles well above 1 do the rising exponents of eq (2) weigh the high
-    harmonics, as the text wants, and because all four terms are then of like magnitude under the paper's weights.
+    harmonics, as the text wants, and because all four terms are then of like magnitude under the paper's weights. One
+    immobile position more costs little then: who needs them all mobile gives mobility and singularity weights of 1e4.
 
     STRUCTURAL_ERROR: (sum of the points' errors beyond their tolerances)^2, mm^2, eq (1). A point's error is what the
         crank dyad misses it by: q is laid from the crank's end A towards the desired point, so it is abs(AP - q).
