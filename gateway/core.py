@@ -186,8 +186,7 @@ class GatewayCore:
     @property
     def learned(self) -> LearnedTorque | None:
         """What has been learned of the demand's cam until now; None if nothing has."""
-        observer = self._demand.observer
-        return None if observer is None else observer.learned
+        return self._demand.learned
 
     # -- commands from outside -----------------------------------------------------------------------------------
 

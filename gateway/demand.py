@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Final, Protocol
 
+from gateway.learning import LearnedTorque
 from gateway.sample import Phase
 from gateway.torque_offsets import TorqueOffsets
 from gateway.units import AxisUnits, wrap_counts
@@ -113,9 +114,23 @@ class CamDemand:
         self.master_position, self.master_velocity, self._acceleration = plan.at(0.0)
 
     @property
-    def observer(self) -> TorqueOffsets | None:
-        """Who is to be shown what the axes do; None if nothing is learned from it."""
-        return self._torques if self._torques is not None and self._torques.is_learning else None
+    def observer(self) -> "CamDemand | None":
+        """Who is to be shown the following errors, see ``observe``; None if nothing is learned from them."""
+        return self if self._torques is not None and self._torques.is_learning else None
+
+    @property
+    def learned(self) -> LearnedTorque | None:
+        """What has been learned of the cam until now; None if nothing has."""
+        return None if self._torques is None else self._torques.learned
+
+    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
+        """Learn from the following errors of a cycle (see `gateway.cycle.ErrorObserver`), if they are the cam's alone.
+
+        They are not while the axes are still being brought onto the plan, or the slave is moved apart from the cam.
+        """
+        if self._torques is not None:
+            is_plain = not self._approach_left and self.law.plainness(master_position) >= 1.0
+            self._torques.observe(master_position, master_velocity, errors, is_steady and is_plain)
 
     @property
     def is_finished(self) -> bool:

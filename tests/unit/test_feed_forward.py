@@ -207,3 +207,36 @@ def test_without_feed_forward_no_torque_is_asked_for(cam):
     for _ in range(700):
         demand.step()
         assert demand.torque_offsets == [0, 0]
+
+
+class Shown:
+    """Stands in for torque offsets that learn, and keeps whether what it was shown was good to learn from."""
+
+    is_learning = True
+    learned = None
+
+    def __init__(self):
+        self.steady = []
+
+    def at(self, position, velocity, acceleration, share):
+        return [0, 0]
+
+    def observe(self, position, velocity, errors, is_steady):
+        self.steady.append(is_steady)
+
+
+def test_nothing_is_learned_while_the_slave_is_moved_apart_from_the_cam(cam):
+    shown = Shown()
+    demand = CamDemand(cam, (UNITS, UNITS), 0.001, 6.0, 30.0, shown)
+    demand.begin(plan(PAPER, 1), (0, 0))
+    for _ in range(260):
+        demand.observer.observe(1.0, 6.0, (0, 0), True)
+        demand.step()
+    # Until the offsets are wholly in force, what the axes show is not what they would show with them.
+    assert shown.steady.index(True) == 250
+    demand.law.shift, demand.law.is_plain = 0.01, False
+    demand.observer.observe(1.0, 6.0, (0, 0), True)
+    assert not shown.steady[-1]
+    demand.law.shift, demand.law.is_plain = 0.0, True
+    demand.observer.observe(1.0, 6.0, (0, 0), False)
+    assert not shown.steady[-1]
