@@ -7,8 +7,10 @@ import typer
 
 from gateway.cli.animation_command import ANIMATE_EPILOG, animate
 from gateway.cli.cam_commands import CHECK_EPILOG, COMPILE_EPILOG, DOWNLOAD_EPILOG, check, compile_command, download
+from gateway.cli.compare_commands import COMPARE_EPILOG, compare
 from gateway.cli.control_commands import CONTROL_EPILOG, control
 from gateway.cli.doctor_command import DOCTOR_EPILOG, doctor
+from gateway.cli.identify_commands import IDENTIFY_EPILOG, identify_command
 from gateway.cli.run_commands import DEMO_EPILOG, RUN_EPILOG, demo, run
 from gateway.cli.synthesis_commands import SYNTHESIZE_EPILOG, synthesize
 from gateway.cli.terminal import errors_answered
@@ -31,6 +33,8 @@ app.command("synthesize", epilog=SYNTHESIZE_EPILOG)(synthesize)
 app.command("animate", epilog=ANIMATE_EPILOG)(animate)
 app.command("doctor", epilog=DOCTOR_EPILOG)(doctor)
 app.command("tune", epilog=TUNE_EPILOG)(tune)
+app.command("compare", epilog=COMPARE_EPILOG)(compare)
+app.command("identify", epilog=IDENTIFY_EPILOG)(identify_command)
 app.command("monitor", epilog=MONITOR_EPILOG)(monitor_command)
 app.command("control", epilog=CONTROL_EPILOG)(control)
 
