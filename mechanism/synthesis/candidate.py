@@ -1,6 +1,7 @@
 """A mechanism that a search has found, with what the task says of it."""
 
 from dataclasses import dataclass
+from math import degrees
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,15 +57,25 @@ class Candidate:
                     f"({what.format(count=round(float(np.cbrt(value))), value=value)})",
                     term.value,
                 )
-        error = self.value(Term.STRUCTURAL_ERROR)
-        if self.task.tolerances is not None and error is not None and error > 0.0:
+        self._require_tolerances()
+
+    def _require_tolerances(self) -> None:
+        tolerances = self.task.tolerances
+        if tolerances is None:
+            return
+        motion = self.servo_motion()
+        beyond = motion.structural_error - tolerances
+        worst = int(np.argmax(beyond))
+        if beyond[worst] > _TOLERANCE_ROUNDING:
             raise SynthesisError(
                 "no feasible mechanism found within the bounds: the term structural error cannot be met "
-                f"(the points miss their tolerances by {np.sqrt(error):.3g} mm in all at best)",
+                f"(point {worst + 1}, theta2 = {degrees(float(motion.theta2[worst])):.2f} deg, is missed by "
+                f"{motion.structural_error[worst] * 1e3:.3f} mm, tolerance {tolerances[worst] * 1e3:.3f} mm)",
                 Term.STRUCTURAL_ERROR.value,
             )
 
 
+_TOLERANCE_ROUNDING = 1e-9
 _FAULTS = (
     (Term.TIMING, "theta2 does not rise over {count} of the steps"),
     (Term.MOBILITY, "links r and s cannot close in {count} positions at best"),

@@ -217,7 +217,9 @@ def test_a_tolerance_that_cannot_be_met_is_named() -> None:
     task = replace(paper_task(), bounds=Bounds(lower, upper), tolerances=np.full(36, 0.0005))
     best = last(search(task, Method.DIFFERENTIAL_EVOLUTION, 1, BUDGET)).best
     assert best.value(Term.MOBILITY) == 0.0
-    with pytest.raises(SynthesisError, match="structural error cannot be met") as error:
+    with pytest.raises(
+        SynthesisError, match=r"structural error cannot be met \(point \d+, theta2 = .*tolerance 0.500 mm"
+    ) as error:
         best.require_feasible()
     assert error.value.term == Term.STRUCTURAL_ERROR.value
     Candidate(replace(task, tolerances=None), best.variables, best.terms, best.objective).require_feasible()
