@@ -18,7 +18,7 @@ from gateway.synthesis.run_search import SearchRun, SearchStatus
 from gateway.synthesis.search_slice import Found
 from gateway.synthesis.state_file import SavedSearch, write_state_file
 from gateway.synthesis.workers import Workers
-from mechanism.errors import UnreachableError
+from mechanism.errors import SynthesisError, UnreachableError
 from mechanism.synthesis.candidate import Candidate
 from mechanism.synthesis.task import Term
 
@@ -116,7 +116,12 @@ class SynthesisSession:
         front = self.status.front()
         found = choose(self.status, choice, front, self.template.motion.structural_error_limit_mm * 1e-3)
         candidate = found.candidate(self.status.settings.task)
-        candidate.require_feasible()
+        try:
+            candidate.require_feasible()
+        except SynthesisError as error:
+            # A mechanism that misses its curve can be looked at, and is told of by the point that it misses most.
+            if error.term != Term.STRUCTURAL_ERROR.value:
+                raise
         machine = write_machine(self.output, candidate, self.template, self._remark(), self.is_speed_fixed)
         motion = linkage_motion(machine.config, REPORT_SAMPLES)
         outcome = SynthesisOutcome(

@@ -5,20 +5,23 @@ import os
 import re
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from config.conversion import desired_curve
+from config.conversion import desired_curve, dynamics_parameters
 from config.loading import load_config
 from gateway.cli import main
+from gateway.synthesis.machine_files import machine_model, write_machine
 from gateway.synthesis.request import SynthesisRequest
 from gateway.synthesis.run_search import SearchStatus
 from gateway.synthesis.session import SynthesisSession
 from gateway.synthesis.state_file import read_state_file
 from gateway.synthesis.workers import InProcess
 from mechanism.curve import load_curve_csv
+from mechanism.dynamics import Dynamics
 from mechanism.five_bar import FiveBar
 from mechanism.synthesis.candidate import Candidate
 from mechanism.synthesis.search import Method
@@ -180,11 +183,7 @@ def test_a_tolerance_that_is_missed_is_told_by_its_point(run, tmp_path):
 @pytest.mark.slow
 def test_a_drive_that_cannot_follow_gets_a_lower_speed_unless_it_is_asked_for(tmp_path):
     """The reference at 80 rpm: its jerk, 12 175 rad/s^3 at 60 rpm, would be 28 859, and the limit is 20 000."""
-    from gateway.synthesis.machine_files import write_machine
-
     task = SynthesisTask.from_curve(desired_curve(PAPER), terms=PAPER_TERMS)
-    from dataclasses import replace
-
     fast = replace(task, speed_rad_per_s=80 * np.pi / 30)
     bar = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))
     found = Candidate(fast, bar.to_array(), np.zeros(4), 0.0)
@@ -195,6 +194,31 @@ def test_a_drive_that_cannot_follow_gets_a_lower_speed_unless_it_is_asked_for(tm
     kept = write_machine(tmp_path / "m.yaml", found, PAPER, "made for a test", is_speed_fixed=True)
     assert kept.config.motion.speed_rpm == pytest.approx(80.0)
     assert any("jerk" in str(error) for error in kept.violations)
+
+
+@pytest.mark.slow
+def test_gains_grow_with_the_inertia_that_an_axis_moves(tmp_path):
+    """The inertia is worked here from the kinetic energy: with one axis at 1 rad/s and the other at rest it is half."""
+    task = SynthesisTask.from_curve(desired_curve(PAPER), terms=PAPER_TERMS)
+    links = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0)).to_array()
+    own = replace(task, machine=machine_model(PAPER))
+    same = write_machine(tmp_path / "m.yaml", Candidate(own, links, np.zeros(4), 0.0), PAPER, "made for a test")
+    assert same.notes == ()
+    heavy = replace(own, machine=replace(own.machine, linear_density_kg_per_m=(3.14, 1.0, 1.0, 1.0)))
+    changed = write_machine(tmp_path / "m.yaml", Candidate(heavy, links, np.zeros(4), 0.0), PAPER, "made for a test")
+
+    def inertia(machine, motion):
+        dynamics = Dynamics(dynamics_parameters(machine), same.prepared.cam.closure)
+        return np.mean([2.0 * dynamics.energy(angles, motion)[0] for angles in zip(theta2, theta5, strict=True)])
+
+    theta2 = np.linspace(0.0, 2 * np.pi, 144, endpoint=False)
+    theta5 = same.prepared.cam.profile.at_many(theta2)[:, 0]
+    for axis, motion in (("cv", (1.0, 0.0)), ("servo", (0.0, 1.0))):
+        factor = inertia(changed.config, motion) / inertia(PAPER, motion)
+        gains, before = (machine.axes[axis].emulation.gains for machine in (changed.config, PAPER))
+        assert factor > 1.2
+        assert gains.K_P / before.K_P == pytest.approx(factor, rel=0.01)
+        assert gains.K_F / before.K_F == pytest.approx(factor, rel=0.01)
 
 
 @pytest.mark.slow
