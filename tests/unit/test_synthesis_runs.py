@@ -10,7 +10,7 @@ from config.loading import load_config
 from gateway.errors import UsageError
 from gateway.synthesis.request import SynthesisRequest
 from gateway.synthesis.run_search import SearchRun, SearchStatus, StartState
-from gateway.synthesis.search_slice import Found, SearchSlice, run_slice
+from gateway.synthesis.search_slice import Found, SearchSlice, _OpenSearches, run_slice
 from gateway.synthesis.state_file import SavedSearch, read_state_file, saved_document, write_state_file
 from gateway.synthesis.workers import InProcess, LocalProcesses, make_workers
 from mechanism.synthesis.search import Method, search
@@ -82,6 +82,22 @@ def test_a_slice_is_the_same_from_a_saved_state_and_from_the_open_search():
     assert one.state == other.state
     assert one.best.variables == other.best.variables
     assert one.evaluations == other.evaluations > first.evaluations
+
+
+@pytest.mark.parametrize("method", [Method.PAPER, Method.DIFFERENTIAL_EVOLUTION])
+def test_processes_that_know_nothing_of_each_other_bring_a_search_to_its_end(method, monkeypatch):
+    """No slice may end within the local improvement, which a saved state begins anew: it would never end."""
+    monkeypatch.setattr(_OpenSearches, "keep", lambda *_: None)
+    one = settings(method, starts=1)
+    state, slices = None, 0
+    while slices < 30:
+        result = run_slice(SearchSlice(one.task, method, 0, 5, one.budget, None, state, one.slice_evaluations))
+        state, slices = result.state, slices + 1
+        if result.is_finished:
+            break
+    assert result.is_finished
+    assert slices > 3
+    assert result.best.variables == run(SearchStatus.beginning(one)).best.variables
 
 
 def test_a_file_keeps_everything(whole, tmp_path):
