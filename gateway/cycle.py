@@ -66,12 +66,12 @@ class SampleSink(Protocol):
 
 
 class ErrorObserver(Protocol):
-    """Who is shown the following errors of every cycle in motion, before the next demand is taken."""
+    """Who is shown the following errors in motion, before the next demand is taken; not those of a missed TPDO."""
 
     def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
         """Errors in counts, one an axis, and the master's demand (rad, rad/s) for the instant at which they were.
 
-        ``is_steady``: the machine is at speed on the cam, every TPDO has come, and nothing that is guarded is amiss.
+        ``is_steady``: the machine is at speed on the cam, and nothing that is guarded is amiss.
         """
         ...
 
@@ -432,7 +432,7 @@ class CyclicLoop:
             self._applied = self._sent
         if self.phase is not _COMMISSIONING:
             self._check(now_ns)
-        if self._observer is not None:
+        if self._observer is not None and not self._awaited:
             self._show_errors(self._observer)
         if self._is_coupled_stop_due:
             self._begin_coupled_stop()
@@ -483,7 +483,7 @@ class CyclicLoop:
             (target - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
             for target, axis in zip(targets, self.axes, strict=True)
         ]
-        is_steady = phase is _CAM and not self._awaited and self.guard.is_quiet
+        is_steady = phase is _CAM and self.guard.is_quiet
         observer.observe(position, velocity, errors, is_steady)
 
     def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:

@@ -176,13 +176,19 @@ class WholeRun:
     """Gateway and emulated machine on a virtual bus, from boot-up to disabled drives."""
 
     def __init__(
-        self, config: GatewayConfig, cycles: int, seed: int = 0, stop_at_s: float | None = None, record_ticks: int = 0
+        self,
+        config: GatewayConfig,
+        cycles: int,
+        seed: int = 0,
+        stop_at_s: float | None = None,
+        record_ticks: int = 0,
+        faults: Any = None,
     ) -> None:
         self.prepared = prepare(config, cycles)
         self.sink = Sink()
         self.machine = build_machine(config, seed, record_ticks=record_ticks)
         self.core = build_core(config, self.prepared.cam.profile, self.prepared.plan, self.sink)
-        bus = VirtualBus([self.core, self.machine], config.bus.bit_rate, seed)
+        bus = VirtualBus([self.core, self.machine], config.bus.bit_rate, seed, faults=faults)
         if stop_at_s is not None:
             bus.run_until(round(stop_at_s * SECOND))
             self.core.request_stop()

@@ -1,6 +1,7 @@
 """Feed-forward and learning on the whole machine: what is left of the following errors, from cycle to cycle."""
 
 import math
+from random import Random
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from torque_study import (
 )
 
 from gateway.preparation import compile_config
+from gateway.sample import Phase
 
 SERVO_PEAK, SERVO_RMS, CV_PEAK = 2, 0.6, 1
 """What learning has to reach within ten machine cycles."""
@@ -50,6 +52,26 @@ def test_the_whole_chain_learns_what_the_fast_loop_learns(cam):
     assert whole.worst(0, 1)[1] > 1.3 * whole.worst(9)[1]
     assert_reached(whole.worst(9))
     assert whole.rms[:, 1] == pytest.approx(fast.rms[:, 1], abs=0.15)
+
+
+class LosingTpdos:
+    """Loses one TPDO in a hundred."""
+
+    def __init__(self):
+        self.random = Random(3)
+
+    def delays_ns(self, sender, frame, now_ns, source):
+        return () if frame.cob_id in {0x181, 0x182} and self.random.random() < 0.01 else (0,)
+
+
+def test_lost_tpdos_do_not_keep_it_from_learning():
+    run = WholeRun(configured(HEAVY, LEARNING), 10, faults=LosingTpdos())
+    samples = run.sink.samples
+    assert np.count_nonzero(samples["flags"] & 3) > 100
+    # An old actual value is no error: what came is looked at.
+    cruise = samples[(samples["phase"] == Phase.CAM) & (samples["flags"] == 0)][-2000:]
+    error = np.abs(cruise["position_demand"] - cruise["position_actual"])
+    assert_reached((error[:, 1].max(), np.sqrt(np.mean(error[:, 1] ** 2.0)), error[:, 0].max()))
 
 
 def test_errors_only_fall_until_they_are_those_of_the_resolver(cam):
