@@ -56,6 +56,17 @@ class FrictionLaw(Enum):
     """It is a steep function of velocity, and an axis under load creeps."""
 
 
+class DemandRounding(Enum):
+    """Where the position controller rounds its demand to counts; see `sim_drive.servo.DemandResolution`."""
+
+    COUNTS = "counts"
+    """In the error and in the difference that K_F multiplies: the paper's eq. (5) to the letter."""
+    UNROUNDED_DIFFERENCE = "unrounded_difference"
+    """In the error alone."""
+    UNROUNDED = "unrounded"
+    """Nowhere."""
+
+
 class MotorSection(Model):
     """The electrical side of motor and amplifier: what it draws, and what bounds the torque at speed."""
 
@@ -106,6 +117,7 @@ class EmulatedDriveSection(Model):
     """Amplitude of an error once a revolution, of a rotor that does not run true."""
     resolver_eccentricity_deg: float = 0.0
     """Angle at which that error passes zero, rising."""
+    demand_rounding: DemandRounding = DemandRounding.UNROUNDED_DIFFERENCE
     output_delay_periods: Annotated[int, Field(ge=0, le=1)] = 0
     """Servo periods (1/1024 s) between the position and the output that the controller makes of it."""
     switches: SwitchesSection = SwitchesSection()

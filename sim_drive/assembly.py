@@ -24,6 +24,7 @@ from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.node_row import describe_row
 from sim_drive.parameter_file import make_parameter_store
 from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, Plant, PlantParameters
+from sim_drive.servo import DemandResolution
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.switches import Switches
 
@@ -214,6 +215,7 @@ def _machine_axis(axis: AxisSection) -> MachineAxis:
         torque_per_volt=axis.emulation.torque_per_volt_Nm,
         rated_torque_Nm=axis.rated_torque_Nm,
         resolver_noise_counts=axis.emulation.resolver_noise_counts,
+        demand_resolution=DemandResolution[axis.emulation.demand_rounding.name],
         output_delay_periods=axis.emulation.output_delay_periods,
         resolver_eccentricity_counts=axis.emulation.resolver_eccentricity_counts,
         resolver_eccentricity_rad=radians(axis.emulation.resolver_eccentricity_deg),

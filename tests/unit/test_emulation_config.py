@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from config.emulation_section import DemandRounding
 from config.loading import ConfigError, load_config, parse_config
 from config.schema import SERVO_RATE_HZ, GatewayConfig
 from mechanism.errors import ParameterError
@@ -62,6 +63,13 @@ def test_further_options_reach_the_plant() -> None:
     assert (plant.parameters.axes[0].breakaway_N_m, plant.parameters.axes[1].breakaway_N_m) == (0.09, 0.0)
     axis = build_machine(with_option("resolver_eccentricity_counts: 4\n      resolver_eccentricity_deg: 90")).axes[0]
     assert (axis.resolver_eccentricity_counts, axis.resolver_eccentricity_rad) == (4.0, pytest.approx(math.pi / 2))
+
+
+def test_every_rounding_of_the_demand_has_its_resolution_in_the_controller() -> None:
+    assert [rounding.name for rounding in DemandRounding] == [resolution.name for resolution in servo.DemandResolution]
+    master, slave = build_machine(with_option("demand_rounding: counts")).axes
+    assert master.demand_resolution is servo.DemandResolution.COUNTS
+    assert slave.demand_resolution is servo.DemandResolution.UNROUNDED_DIFFERENCE
 
 
 @pytest.mark.parametrize(
