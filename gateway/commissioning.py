@@ -165,6 +165,12 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
     increments = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 1)
     revolutions = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 2)
     problems: list[str] = []
+    most = yield from _read_if_there(master, node_id, objects.MAX_TORQUE, 0, U16)
+    if node.torque_limit_permille is not None and most is not None and node.torque_limit_permille >= most:
+        problems.append(
+            f"node {node_id} gives {most} per mille of its rated torque at most (6072h), at the guard's "
+            f"torque.limit_permille of {node.torque_limit_permille} it can never trip"
+        )
     if rated is not None and rated != node.rated_torque_mNm:
         problems.append(
             f"node {node_id} has a rated torque of {rated} mN m (6076h), the configuration says {node.rated_torque_mNm}"
@@ -180,10 +186,12 @@ def write_parameters(master: Master, node: NodeSettings, network: NetworkSetting
         raise CommissioningError(problems)
 
 
-def _read_if_there(master: Master, node_id: int, index: int, subindex: int) -> Procedure[int | None]:
-    """Read an UNSIGNED32 that the standard leaves optional; None from a drive that does not have it."""
+def _read_if_there(
+    master: Master, node_id: int, index: int, subindex: int, data_type: DataType = U32
+) -> Procedure[int | None]:
+    """Read an integer that the standard leaves optional; None from a drive that does not have it."""
     try:
-        return (yield from master.read_int(node_id, index, subindex, U32))
+        return (yield from master.read_int(node_id, index, subindex, data_type))
     except SdoAbortedError as error:
         if error.code not in {AbortCode.OBJECT_DOES_NOT_EXIST, AbortCode.SUBINDEX_DOES_NOT_EXIST}:
             raise

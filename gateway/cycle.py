@@ -466,6 +466,10 @@ class CyclicLoop:
             outbox.append(Frame(axis.rpdo_cob_id, payload))
 
     def _check(self, now_ns: int) -> None:
+        if self.phase is Phase.DISABLED:
+            # Drives without torque call for no reaction; which of them is there is asked all the same.
+            self._watch.note_silence(self._awaited)
+            return
         master_position, _, _, targets, _, phase = self._in_force
         self._watch.check(self._awaited, targets, master_position, phase, self.is_guarding_enabled, now_ns)
         if self.guard.tripped:

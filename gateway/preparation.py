@@ -21,7 +21,7 @@ from gateway.learning import Learning, build_learning
 from gateway.operation import Operation
 from gateway.powering import AxisSetup
 from gateway.reactions import CoupledStop
-from gateway.torque_offsets import build_torque_offsets, torque_violations
+from gateway.torque_offsets import build_feed_forward, build_torque_offsets, torque_violations
 from gateway.units import AxisUnits
 from gateway.watch import AxisLimits, CamWindow, CycleWatch
 from mechanism.approach import ApproachField
@@ -34,6 +34,7 @@ from mechanism.slave_law import LawLimits, SlaveLaw
 JOG_SHARE: Final = 4.0
 """A jog is at most so many times slower than the run."""
 RAMP_GRID: Final = 4096
+TORQUE_GRID: Final = 256
 WHOLE_REVOLUTION: Final = 1e-9
 """Share of a revolution that is rounding, and asks for no revolution more."""
 NS_PER_US: Final = 1000
@@ -90,6 +91,7 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
         *cam.violations,
         *_ramp_violations(config, cam.profile),
         *_home_violations(config, cam.profile),
+        *_guard_violations(config, cam.profile),
         *torque_violations(config, cam.profile),
     )
     if is_strict and violations:
@@ -166,6 +168,25 @@ def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[Gateway
             f"{math.degrees(on_cam):.3f} deg where the master is at home (bound {window} counts)"
         )
     ]
+
+
+def _guard_violations(config: GatewayConfig, profile: CamProfile) -> list[GatewayError]:
+    """Torques that the model of the machine needs on its cam, and that the guard would take for too much."""
+    limit = config.guard.torque.limit_permille
+    model = build_feed_forward(config, profile)
+    theta2 = np.linspace(0.0, math.tau, TORQUE_GRID, endpoint=False)
+    torques = np.abs([model.torques(position, config.speed_rad_per_s, 0.0) for position in theta2.tolist()])
+    found: list[GatewayError] = []
+    for number, (name, axis) in enumerate(zip(config.axis_names, config.ordered_axes, strict=True)):
+        needed = float(torques[:, number].max()) / axis.rated_torque_Nm * 1000.0
+        if needed > limit:
+            found.append(
+                GatewayError(
+                    f"guard.torque.limit_permille: {limit} would always trip, axis {name} needs {needed:.0f} per mille "
+                    f"of its rated torque at {config.motion.speed_rpm:g} rpm"
+                )
+            )
+    return found
 
 
 def slave_law(config: GatewayConfig, profile: CamProfile) -> SlaveLaw:

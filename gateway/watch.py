@@ -102,6 +102,11 @@ class CycleWatch:
         if cam is not None and is_enabled and not awaited and _RAMP_UP <= phase <= _CONTROLLED_STOP:
             self._check_cam(cam, targets, master_position, now_ns)
 
+    def note_silence(self, awaited: int) -> None:
+        """One cycle of which only this counts: whose TPDO is missing (bits as for ``check``)."""
+        for number, axis in enumerate(self._axes):
+            axis.silent_cycles = axis.silent_cycles + 1 if awaited >> number & 1 else 0
+
     def _check_missing(self, awaited: int, now_ns: int) -> None:
         guard = self._guard
         is_nobody_here = awaited == self._all_axes

@@ -8,13 +8,15 @@ import pytest
 
 from config.guard_section import Reaction
 from config.loading import ConfigError, load_config, parse_config
+from drivers.virtual_time import VirtualBus
 from gateway.axis_channel import AxisChannel
 from gateway.guard import REASON_OF, Condition, Guard, StopReason
-from gateway.preparation import compile_config, guard_limits, slave_law
+from gateway.preparation import build_core, compile_config, guard_limits, prepare, slave_law
 from gateway.sample import Phase
 from gateway.units import AxisUnits
 from gateway.watch import AxisLimits, CycleWatch
 from mechanism.deviation import end_effector_miss
+from sim_drive.assembly import build_machine
 
 PAPER = load_config("paper")
 PROFILE = compile_config(PAPER).profile
@@ -182,3 +184,24 @@ def test_the_end_effectors_distance_by_hand():
     # No closure: far out of reach.
     far = np.array([1.0, 0.1, 0.1, 1.0, 0.0, 0.0, 9.0, 0.0])
     assert math.isnan(end_effector_miss(far, 1, 0.0, 0.0, 0.0, 0.0))
+
+
+def test_a_torque_limit_below_what_the_cam_needs_would_always_trip():
+    """The servo axis needs 0.74 N m of 1.5 N m rated in the return stroke (see the report of a run)."""
+    low = parse_config(PAPER.text.replace("limit_permille: 2500", "limit_permille: 300"), PAPER.path)
+    violations = [str(violation) for violation in prepare(low, 1, is_strict=False).violations]
+    assert any("guard.torque.limit_permille: 300 would always trip, axis" in sentence for sentence in violations)
+    assert prepare(PAPER, 1).violations == ()
+
+
+def test_a_torque_limit_that_the_drive_never_reaches_is_refused_by_commissioning():
+    strong = parse_config(PAPER.text.replace("limit_permille: 2500", "limit_permille: 9000"), PAPER.path)
+    core = build_core(strong, PROFILE, prepare(PAPER, 1).plan, NoSink())
+    bus = VirtualBus([core, build_machine(PAPER)], PAPER.bus.bit_rate)
+    bus.run_while(lambda: not core.is_done, 1_000_000_000)
+    assert "node 1 gives 3000 per mille of its rated torque at most (6072h)" in str(core.failure)
+
+
+class NoSink:
+    def append(self, *values):
+        pass

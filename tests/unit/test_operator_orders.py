@@ -71,6 +71,7 @@ def test_an_order_is_answered_by_its_event(monkeypatch):
             send_order("answered-orders", Order.OVERRIDE, 50.0)
 
 
+@pytest.mark.slow
 def test_without_a_run_the_command_says_so_and_ends_with_1():
     command = [sys.executable, "-m", "gateway.cli", "control", "paper", "override", "50"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -74,6 +74,7 @@ def test_from_wherever_the_linkage_was_moved_by_hand(theta2, theta5):
     Again(first, theta2 + turns, theta5).to_end().assert_approached_and_ran_home()
 
 
+@pytest.mark.slow
 def test_a_stop_on_the_way_is_one_and_a_place_without_a_way_is_refused():
     first = Guarded(cycles=1).to_end()
     turns = round(math.degrees(first.machine.plant.angle(0)) / 360.0) * 360.0

@@ -165,10 +165,7 @@ def test_no_condition_is_left_out():
     [
         (Condition.CAM_WINDOW, "return stroke"),
         (Condition.MISSED_DEADLINE, "ramp up"),
-        (Condition.BUS_OFF, "return stroke"),
         (Condition.SYNC_LOST, "ramp down"),
-        (Condition.SIGTERM, "cam"),
-        (Condition.TORQUE, "enabling"),
     ],
 )
 def test_a_sample_of_conditions(condition, phase):

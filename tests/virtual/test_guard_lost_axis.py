@@ -59,10 +59,10 @@ def assert_linkage_kept(run, at_s):
 @pytest.mark.parametrize(
     ("kind", "node", "theta2"),
     [
-        (FaultKind.OVER_CURRENT, CV, 330),
         (FaultKind.OVER_CURRENT, SERVO, 5),
         (FaultKind.FROZEN_RESOLVER, CV, 320),
-        (FaultKind.POWER_CYCLE, SERVO, 325),
+        pytest.param(FaultKind.OVER_CURRENT, CV, 330, marks=pytest.mark.slow),
+        pytest.param(FaultKind.POWER_CYCLE, SERVO, 325, marks=pytest.mark.slow),
     ],
 )
 def test_whichever_axis_is_lost_the_other_keeps_the_linkage_together(kind, node, theta2):
@@ -74,7 +74,7 @@ def test_whichever_axis_is_lost_the_other_keeps_the_linkage_together(kind, node,
 @pytest.mark.slow
 @pytest.mark.parametrize("node", [CV, SERVO])
 @pytest.mark.parametrize("kind", LOSSES)
-@pytest.mark.parametrize("theta2", [5, 100, 186, 310, 335])
+@pytest.mark.parametrize("theta2", [186, 310])
 def test_the_linkage_is_kept_together_whatever_is_lost_wherever(kind, node, theta2):
     at_s = at_theta2(theta2)
     assert_linkage_kept(lose(kind, node, at_s), at_s)
@@ -88,6 +88,7 @@ def test_a_gateway_that_looks_on_tears_the_linkage():
     assert run.strain(at_s).least_sine < 0.1
 
 
+@pytest.mark.slow
 def test_the_slave_follows_a_master_that_runs_out_without_torque_and_brake():
     """The slave, which has torque, stays on the cam of a master that swings freely until that comes to rest."""
     at_s = at_theta2(32)

@@ -1,6 +1,6 @@
 """Hours of machine time with random faults: every stop within its bound, no exception, no leak.
 
-``DRIVE_GATEWAY_SOAK_HOURS`` sets the machine hours (default 0.1, some thirty seconds of processor time).
+``DRIVE_GATEWAY_SOAK_HOURS`` sets the machine hours (default 0.08, some thirty seconds of processor time).
 """
 
 import gc
@@ -21,7 +21,7 @@ from sim_drive.assembly import build_machine
 from sim_drive.faults import Direction, Fault, FaultKind
 from sim_drive.injector import Injector
 
-HOURS = float(os.environ.get("DRIVE_GATEWAY_SOAK_HOURS", "0.1"))
+HOURS = float(os.environ.get("DRIVE_GATEWAY_SOAK_HOURS", "0.08"))
 LASTING = (FaultKind.FROZEN_RESOLVER,)
 STOP_BOUND_S = 2.5
 """From the first trip to drives without torque: a controlled stop at 60 rpm takes 1.4 s, settling and disabling 0.7."""

@@ -88,6 +88,7 @@ def test_a_phase_shift_moves_the_slave_along_its_cam_and_back():
     assert run.trips == []
 
 
+@pytest.mark.slow
 def test_the_slave_leaves_its_cam_at_an_angle_and_returns_at_another():
     run = Operated(cycles=3).order(at_theta2(180), Order.DISENGAGE, 200.0)
     run.until(at_theta2(280))
@@ -110,9 +111,11 @@ def test_the_slave_leaves_its_cam_at_an_angle_and_returns_at_another():
     ("order", "value", "sentence"),
     [
         (Order.DISENGAGE, 300.0, "would bring the linkage to a transmission sine of"),
-        (Order.PHASE_SHIFT, 170.0, "would bring the linkage to a transmission sine of"),
-        (Order.OVERRIDE, 101.0, "is not 0 to 100 %"),
-        (Order.ENGAGE, 0.0, "the slave is on its cam already"),
+        pytest.param(
+            Order.PHASE_SHIFT, 170.0, "would bring the linkage to a transmission sine of", marks=pytest.mark.slow
+        ),
+        pytest.param(Order.OVERRIDE, 101.0, "is not 0 to 100 %", marks=pytest.mark.slow),
+        pytest.param(Order.ENGAGE, 0.0, "the slave is on its cam already", marks=pytest.mark.slow),
     ],
 )
 def test_what_would_break_something_is_refused_and_changes_nothing(order, value, sentence):

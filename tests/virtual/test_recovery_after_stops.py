@@ -55,6 +55,7 @@ def test_a_fault_is_reset_by_one_edge_and_the_run_may_begin_anew_from_there():
     Again(run).to_end().assert_approached_and_ran_home()
 
 
+@pytest.mark.slow
 def test_a_cause_that_goes_on_keeps_its_fault():
     run, frames = recover(Fault(FaultKind.SAFE_TORQUE_OFF, CV, AT_S))
     assert not outcomes(run)["cv"].is_ready
@@ -68,8 +69,14 @@ def test_a_cause_that_goes_on_keeps_its_fault():
     ("fault", "text"),
     [
         (Fault(FaultKind.POWER_CYCLE, SERVO, AT_S, 0.7), f"commissioned anew, {LOST_REFERENCE}"),
-        (Fault(FaultKind.NODE_RESET, SERVO, AT_S), f"commissioned anew, {LOST_REFERENCE}"),
-        (Fault(FaultKind.BUS_OFF, SERVO, AT_S, 0.3), "commissioned anew, fault reset, ready for a new run"),
+        pytest.param(
+            Fault(FaultKind.NODE_RESET, SERVO, AT_S), f"commissioned anew, {LOST_REFERENCE}", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            Fault(FaultKind.BUS_OFF, SERVO, AT_S, 0.3),
+            "commissioned anew, fault reset, ready for a new run",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, text):
@@ -81,6 +88,7 @@ def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, t
     assert_at_rest(run)
 
 
+@pytest.mark.slow
 def test_an_axis_without_a_reference_is_not_homed_away_from_home():
     run, _ = recover(Fault(FaultKind.NODE_RESET, SERVO, AT_S))
     again = Again(run).to_end()
@@ -89,6 +97,7 @@ def test_an_axis_without_a_reference_is_not_homed_away_from_home():
     assert Phase.APPROACH not in {Phase(int(sample[12])) for sample in again.samples}
 
 
+@pytest.mark.slow
 def test_a_node_that_stays_away_is_given_up():
     run, frames = recover(Fault(FaultKind.POWER_CYCLE, CV, AT_S))
     assert outcomes(run)["cv"].text == f"node 1 has not come back within {PAPER.recovery.timeout_s:g} s"
