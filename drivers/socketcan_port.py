@@ -21,6 +21,7 @@ _CAN_RAW: Final = 1
 _SOL_CAN_RAW: Final = 101
 _CAN_RAW_FILTER: Final = 1
 _CAN_RAW_ERR_FILTER: Final = 2
+_CAN_RAW_RECV_OWN_MSGS: Final = 4
 _CAN_EFF_FLAG: Final = 0x80000000
 _CAN_RTR_FLAG: Final = 0x40000000
 _CAN_ERR_FLAG: Final = 0x20000000
@@ -67,9 +68,11 @@ class SocketcanPort:
         channel: str,
         filters: Sequence[tuple[int, int]] | None = None,
         carrier: socket.socket | None = None,
+        hears_own: bool = False,
     ) -> None:
         """Open the interface ``channel``; ``filters`` are pairs of COB-ID and mask, applied by the kernel.
 
+        ``hears_own``: also receive what is sent here, when it has been on the bus, and in the bus' order.
         ``carrier``: a socket that does not block and carries ``CAN_FRAME`` datagrams, in place of the interface.
 
         Raises:
@@ -80,6 +83,8 @@ class SocketcanPort:
         self.error_frame_count = 0
         """Error frames, whatever they reported."""
         self._socket = self._open(channel, filters) if carrier is None else carrier
+        if hears_own:
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_RECV_OWN_MSGS, 1)
         self._clock: Final = ArrivalClock()
         self._batch: Final = MessageBatch(self._socket)
         self._batch_count = 0

@@ -7,10 +7,11 @@ from config.schema import GatewayConfig, SyncSource
 from drivers.broadcast_manager import PeriodicFrame
 from drivers.errors import BusError
 from drivers.nmt import EMCY_BASE, HEARTBEAT_BASE, SYNC_COB_ID
-from drivers.pdo import TPDO_BASE
+from drivers.pdo import RPDO_BASE, TPDO_BASE
 from drivers.ports import Port
 from drivers.real_time import RealTimeFeature, RealTimeSetting
 from drivers.sdo import SDO_RESPONSE_BASE
+from drivers.socketcan_port import SocketcanPort
 from gateway.bus_address import BusAddress
 from gateway.cycle import SYNC_FRAME
 from gateway.errors import GatewayError
@@ -29,6 +30,8 @@ class CycleBus:
     sync: PeriodicFrame | None
     """The kernel's SYNC; None where the loop sends it."""
     sync_setting: RealTimeSetting
+    echo_cob_id: int | None = None
+    """Of the last demand of a cycle, where ``cyclic`` hears it when it has been on the bus."""
 
     def close(self) -> None:
         """Leave the bus; the kernel's SYNC ends with it."""
@@ -53,11 +56,16 @@ def open_cycle_bus(address: BusAddress, config: GatewayConfig, listener: Port) -
         return CycleBus(listener, None, None, _loop_setting(f"{address.interface} has no timer of its own"))
     sync, setting = _sync_timer(address, config)
     node_ids = [axis.node_id for axis in config.ordered_axes]
-    own = [SYNC_COB_ID] if sync is not None else []
-    cyclic = address.open(_exactly(own + [TPDO_BASE[0] + node_id for node_id in node_ids]))
+    tpdos = [TPDO_BASE[0] + node_id for node_id in node_ids]
+    if sync is None:
+        cyclic, echo = address.open(_exactly(tpdos)), None
+    else:
+        # Which demand a SYNC takes over is a matter of their order on the bus, and only the bus can tell it.
+        echo = RPDO_BASE[0] + node_ids[-1]
+        cyclic = SocketcanPort(address.channel, _exactly([SYNC_COB_ID, echo, *tpdos]), hears_own=True)
     bases = (EMCY_BASE, SDO_RESPONSE_BASE, HEARTBEAT_BASE)
     service = address.open(_exactly([base + node_id for node_id in node_ids for base in bases]))
-    return CycleBus(cyclic, service, sync, setting)
+    return CycleBus(cyclic, service, sync, setting, echo)
 
 
 def _sync_timer(address: BusAddress, config: GatewayConfig) -> tuple[PeriodicFrame | None, RealTimeSetting]:

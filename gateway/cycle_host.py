@@ -66,14 +66,17 @@ class CycleHost:
         service: Port | None = None,
         sync: SyncTimer | None = None,
         late: LateWatch | None = None,
+        echo_cob_id: int | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         """``cyclic`` carries SYNC and PDOs, ``service`` all the rest; None where ``cyclic`` carries that too.
 
         ``sync`` sends SYNC, and ``cyclic`` then hears it; None leaves it to the loop. ``poll`` is called at least once
-        a cycle.
+        a cycle. ``echo_cob_id``: the last frame of each demand, which ``cyclic`` hears when it has been on the bus;
+        None: what has been sent is taken to be on the bus.
         """
+        self._echo_cob_id = echo_cob_id
         self._core = core
         self._cyclic = cyclic
         self._service = service
@@ -125,6 +128,9 @@ class CycleHost:
             frame, arrival_ns = received
             if arrival_ns > self._latest_ns:
                 self._latest_ns = arrival_ns
+            if frame.cob_id == self._echo_cob_id:
+                core.loop.sent(self._latest_ns)
+                continue
             core.receive(frame, self._latest_ns)
             if frame.cob_id == SYNC_COB_ID:
                 core.loop.woke(self._lateness_ns)
@@ -146,7 +152,11 @@ class CycleHost:
                 # Not on the bus yet: as it stands now, it comes too late.
                 loop.sent(loop.sync_due_ns + loop.period_ns)
                 return
-        loop.sent(self._clock())
+        if self._echo_cob_id is None or not loop.is_paced:
+            loop.sent(self._clock())
+        elif any(frame.cob_id == self._echo_cob_id for frame in frames):
+            # Not before the bus says so.
+            loop.sent(loop.sync_due_ns + loop.period_ns)
         self._switch_sync()
         self._follow_cycle()
         # A loop that is always late never waits, and must hear of a stop all the same.

@@ -133,7 +133,9 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
 def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late: LateWatch | None = None) -> None:
     """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
     try:
-        CycleHost(core, bus.cyclic, poll, service=bus.service, sync=bus.sync, late=late).run()
+        CycleHost(
+            core, bus.cyclic, poll, service=bus.service, sync=bus.sync, late=late, echo_cob_id=bus.echo_cob_id
+        ).run()
     except BusError:
         raise
     except Exception:

@@ -39,7 +39,7 @@ class Samples:
 class World:
     """Time, a bus on which two drives answer SYNC after 0.2 and 0.3 ms, and a kernel that sends SYNC."""
 
-    def __init__(self, prepared, is_kernel, full_sends=()):
+    def __init__(self, prepared, is_kernel, full_sends=(), echo_cob_id=None):
         self.now_ns = 0
         self.queue = []
         self.sent = []
@@ -51,8 +51,16 @@ class World:
         self.core = build_core(CONFIG, prepared.cam.profile, prepared.plan, self.samples)
         self.core._session = iter(lambda: 1 << 62, None)  # the session waits for ever: the cycle alone is looked at
         self.core.loop.start(0)
+        self.echo_cob_id = echo_cob_id
+        self.slow_cycles = ()
         self.host = CycleHost(
-            self.core, self, self.poll, sync=self if is_kernel else None, clock=lambda: self.now_ns, sleep=self.sleep
+            self.core,
+            self,
+            self.poll,
+            sync=self if is_kernel else None,
+            echo_cob_id=echo_cob_id,
+            clock=lambda: self.now_ns,
+            sleep=self.sleep,
         )
 
     # the kernel's SYNC
@@ -69,6 +77,11 @@ class World:
             self.full_sends.discard(len(self.sent))
             return False
         self.sent.append((self.now_ns, frame))
+        if frame.cob_id == self.echo_cob_id:
+            self.queue.append((self.now_ns, frame))
+        if frame.cob_id == 0x202 and self.core.loop.cycle in self.slow_cycles:
+            # The processor is taken away right after the frame has gone: the clock is read too late.
+            self.pass_time(self.now_ns + 900_000)
         if frame.cob_id == SYNC_COB_ID:
             self.answer(self.now_ns)
         return True
@@ -135,6 +148,19 @@ def test_a_full_buffer_is_offered_the_frame_again_and_counted(prepared):
     assert not any(flags & SampleFlag.MISSED_RPDO_DEADLINE for flags in world.samples.flags)
     demands = [frame.cob_id for _, frame in world.sent]
     assert demands.count(0x201) == demands.count(0x202)
+
+
+def test_the_order_on_the_bus_tells_which_sync_takes_a_demand(prepared):
+    """The RPDOs of cycles 50 and 120 are on the bus 0.68 ms before SYNC; the loop comes to its clock after it."""
+    believed = {}
+    for echo_cob_id in (None, 0x202):
+        world = World(prepared, True, echo_cob_id=echo_cob_id)
+        world.slow_cycles = (50, 120)
+        world.host.run()
+        flags = world.samples.flags
+        believed[echo_cob_id] = [n for n, flag in enumerate(flags) if flag & SampleFlag.MISSED_RPDO_DEADLINE]
+        assert sorted(world.samples.leads)[100] > 600_000
+    assert believed == {None: [50, 120], 0x202: []}
 
 
 def test_a_demand_that_never_got_onto_the_bus_has_missed_its_deadline(prepared):
