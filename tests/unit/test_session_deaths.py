@@ -30,6 +30,8 @@ def machine(tmp_path):
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 2000}
     config["guard"] |= {name: {"reaction": "warn"} for name in ("missed_tpdo", "missed_deadline", "axis_silent")}
     config["guard"]["sync_lost"] = {"limit_cycles": 100, "reaction": "warn"}
+    # A cycle that is lost on the way is 16 counts of travel here.
+    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     path = tmp_path / "deaths.yaml"
     path.write_text(yaml.safe_dump(config))
     return config["name"], path

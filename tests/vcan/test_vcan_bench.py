@@ -83,6 +83,8 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error")
     config["guard"] |= {name: {"reaction": "warn"} for name in warned}
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
+    # A cycle that is lost on the way is 16 counts of travel here.
+    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     path = tmp_path_factory.mktemp("bench") / "bench.yaml"
     path.write_text(yaml.safe_dump(config))
     return path
