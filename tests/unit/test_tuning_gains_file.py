@@ -35,7 +35,7 @@ def test_a_block_with_comments_and_missing_gains_keeps_its_style():
 
 
 def test_axes_are_found_by_their_names_in_any_order():
-    start, end = PAPER.text.index("  cv:\n"), PAPER.text.index("\nbus:\n")
+    start, end = PAPER.text.index("  cv:\n"), PAPER.text.index("\n\n", PAPER.text.index("  servo:\n"))
     servo = PAPER.text.index("  servo:\n")
     text = (
         PAPER.text[:start] + PAPER.text[servo:end] + "\n" + PAPER.text[start:servo].rstrip() + "\n" + PAPER.text[end:]
