@@ -129,3 +129,31 @@ def test_axes_that_share_a_node_are_told_apart_by_their_names() -> None:
     assert fault.axis is None
     (fault,) = parse_fault("servo mute_heartbeat", names, [1], numbers)
     assert fault.axis is None
+
+
+EXTRAS = {
+    FaultKind.OVER_CURRENT: "for_s=1 error_code=0x2320 axis=1",
+    FaultKind.JUMPING_RESOLVER: "for_s=2 counts=-40 axis=1",
+    FaultKind.NODE_RESET: "",
+    FaultKind.WRONG_IDENTITY: "for_s=1 vendor_id=7 serial_number=9",
+    FaultKind.SLOW_SDO: "for_s=1 delay_s=0.25",
+    FaultKind.SDO_ABORT: "index=0x6040 subindex=0 abort_code=0x08000022",
+    FaultKind.LATE_FRAMES: "delay_s=0.002 cob_id=0x185 cob_id_mask=0x7FF direction=sent probability=0.5 count=3",
+}
+"""What is given with a kind beside ``at_s``; a second's duration for the others."""
+
+
+@pytest.mark.parametrize("kind", FaultKind)
+def test_every_fault_is_the_same_in_a_file_on_the_command_line_and_in_python(kind: FaultKind) -> None:
+    words = f"at_s=1.5 {EXTRAS.get(kind, 'for_s=1')}".split()
+    items = dict(word.split("=") for word in words)
+    (told,) = parse_fault(f"servo {kind.value} {' '.join(words)}", {"servo": 5}, [5])
+    entry = ", ".join(f"{key}: {value}" for key, value in {"node": "servo", "kind": kind.value, **items}.items())
+    scenario = parse_scenario(f"faults: [{{{entry}}}]", Path("trouble.yaml"), {"servo": 5}, [5])
+    numbers = {
+        key: Direction(text) if key == "direction" else float(text) if key.endswith("_s") or key == "probability"
+        else int(text, 0)
+        for key, text in items.items()
+    }  # fmt: skip
+    made = Fault(kind, 5, **numbers)  # type: ignore[arg-type]
+    assert (told,) == scenario.faults == (made,)
