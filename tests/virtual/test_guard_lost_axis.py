@@ -60,7 +60,7 @@ def assert_linkage_kept(run, at_s):
     ("kind", "node", "theta2"),
     [
         (FaultKind.OVER_CURRENT, SERVO, 5),
-        (FaultKind.FROZEN_RESOLVER, CV, 320),
+        pytest.param(FaultKind.FROZEN_RESOLVER, CV, 320, marks=pytest.mark.slow),
         pytest.param(FaultKind.OVER_CURRENT, CV, 330, marks=pytest.mark.slow),
         pytest.param(FaultKind.POWER_CYCLE, SERVO, 325, marks=pytest.mark.slow),
     ],
@@ -88,7 +88,6 @@ def test_a_gateway_that_looks_on_tears_the_linkage():
     assert run.strain(at_s).least_sine < 0.1
 
 
-@pytest.mark.slow
 def test_the_slave_follows_a_master_that_runs_out_without_torque_and_brake():
     """The slave, which has torque, stays on the cam of a master that swings freely until that comes to rest."""
     at_s = at_theta2(32)
