@@ -57,7 +57,7 @@ class Refusal:
         Refusal(
             "following_error_counts: 300", "following_error_counts: 2048", "2048 can never trip, half a revolution"
         ),
-        Refusal("limit_cycles: 5", "limit_cycles: 200", "can never trip in time, after 200 ms the drives have missed"),
+        Refusal("limit_cycles: 20", "limit_cycles: 200", "can never trip in time, after 200 ms the drives have missed"),
         Refusal(
             "sigterm: {reaction: controlled_stop}", "sigterm: {reaction: warn}", "warn would leave the machine running"
         ),

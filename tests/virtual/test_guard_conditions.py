@@ -101,7 +101,7 @@ CASES = {
         lambda at_s: both(FaultKind.BUS_OFF, at_s, 0.5),
         (("missed_tpdo: {persistence_cycles: 20", "missed_tpdo: {persistence_cycles: 200"),),
     ),
-    Condition.SYNC_LOST: Case(StopReason.SYNC_LOST, away_s=0.015),
+    Condition.SYNC_LOST: Case(StopReason.SYNC_LOST, away_s=0.025),
     Condition.OPERATOR_STOP: Case(StopReason.OPERATOR, wish=Condition.OPERATOR_STOP, is_controlled=True),
     Condition.SIGINT: Case(StopReason.OPERATOR, wish=Condition.SIGINT, is_controlled=True),
     Condition.SIGTERM: Case(

@@ -30,7 +30,7 @@ IDLE = changed(
     ),
     ("limit_deg: 1.0, reaction: disable", "limit_deg: 1.0, reaction: warn"),
     ("persistence_cycles: 20, reaction: controlled_stop", "reaction: warn"),
-    ("limit_cycles: 5, reaction: quick_stop", "limit_cycles: 5, reaction: warn"),
+    ("limit_cycles: 20, reaction: quick_stop", "limit_cycles: 20, reaction: warn"),
 )
 """A gateway that looks on."""
 LOSSES = [
