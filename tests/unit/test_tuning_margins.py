@@ -23,7 +23,7 @@ from gateway.tuning.margins import (
     robustness,
     spectral_radius,
 )
-from gateway.tuning.response import measure_loop
+from gateway.tuning.response import FINE_COUNTS, frictionless_text, measure_loop
 from sim_drive import servo
 from sim_drive.closed_loop import closed_loop_of
 
@@ -150,12 +150,8 @@ def test_the_model_agrees_with_the_measured_response(theta2_deg):
 
     With resolvers of 2^20 counts, so that quantisation does not hide the loop, without dry friction, held still.
     """
-    fine = 2**20
-    config = changed(
-        ("counts_per_revolution: 4096", f"counts_per_revolution: {fine}"),
-        ("coulomb_Nm: 0.04", "coulomb_Nm: 0.0"),
-        ("coulomb_Nm: 0.05", "coulomb_Nm: 0.0"),
-    )
+    fine = FINE_COUNTS
+    config = parse_config(frictionless_text(PAPER), PAPER.path)
     cam = compile_config(config)
     theta2 = math.radians(theta2_deg)
     theta = (theta2, cam.profile.at(theta2)[0])
