@@ -15,7 +15,8 @@ from config.schema import SINGULAR_SHARE, AxisSection, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
-from sim_drive.compliant import CompliantPlant, Coupling
+from sim_drive.compliant import CompliantPlant
+from sim_drive.coupling import Coupling
 from sim_drive.drive import Drive
 from sim_drive.driveline import MotorParameters
 from sim_drive.energy_meter import attach_energy_meter

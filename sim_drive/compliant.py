@@ -6,8 +6,8 @@ link's side are the linkage and the coupling's other half. An axis without a cou
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from math import inf, isfinite, isnan
+from dataclasses import replace
+from math import inf, isnan
 from typing import Final
 
 import numpy as np
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mechanism.dynamics import energy, linkage_sine
 from mechanism.jit import kernel
+from sim_drive.coupling import MOTOR_INERTIA, STIFFNESS, Coupling, coupling_row, coupling_torques
 from sim_drive.driveline import (
     DECAY,
     DECAY_HALF,
@@ -50,61 +51,6 @@ _FRICTION: Final = 10
 _FLOW: Final = 12
 _VARIABLES: Final = 14
 
-# Layout of the couplings' array, a row an axis.
-_STIFFNESS: Final = 0
-"""inf: none, the motor sits on its link."""
-_DAMPING: Final = 1
-_HALF_PLAY: Final = 2
-_MOTOR_INERTIA: Final = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Coupling:
-    """What joins a motor to its link: a spring and a damper in parallel, behind some play.
-
-    ``backlash_rad`` is the play from one end to the other. Within it nothing is passed on; at its ends the spring
-    pushes and never pulls. ``link_side_inertia_kg_m2`` is the half that turns with the link.
-
-    Raises ValueError where a value is out of its bounds.
-    """
-
-    stiffness_N_m_per_rad: float
-    damping_N_m_s_per_rad: float = 0.0
-    backlash_rad: float = 0.0
-    link_side_inertia_kg_m2: float = 2e-5
-
-    def __post_init__(self) -> None:
-        for name, value in (
-            ("stiffness_N_m_per_rad", self.stiffness_N_m_per_rad),
-            ("link_side_inertia_kg_m2", self.link_side_inertia_kg_m2),
-        ):
-            if not (isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} = {value!r}, must be finite and positive")
-        for name, value in (
-            ("damping_N_m_s_per_rad", self.damping_N_m_s_per_rad),
-            ("backlash_rad", self.backlash_rad),
-        ):
-            if not (isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} = {value!r}, must be finite and zero or more")
-
-
-@kernel
-def coupling_torques(couplings: Float, axis: int, twist: float, rate: float) -> tuple[float, float]:
-    """(torque, its elastic part) that a coupling passes on to the link at a twist (rad) and its rate (rad/s), N m."""
-    half_play = couplings[axis, _HALF_PLAY]
-    stiffness = couplings[axis, _STIFFNESS]
-    damping = couplings[axis, _DAMPING]
-    if half_play == 0.0:
-        elastic = stiffness * twist
-        return elastic + damping * rate, elastic
-    if twist > half_play:
-        elastic = stiffness * (twist - half_play)
-        return max(elastic + damping * rate, 0.0), elastic
-    if twist < -half_play:
-        elastic = stiffness * (twist + half_play)
-        return min(elastic + damping * rate, 0.0), elastic
-    return 0.0, 0.0
-
 
 @kernel
 def _axis_torques(
@@ -119,11 +65,11 @@ def _axis_torques(
 ) -> tuple[float, float, float, float]:
     """(acceleration of the motor if it has a coupling, torque on the link, smooth friction, coupling's heat flow)."""
     friction = smooth_resistance(settings, axis, motor_velocity)
-    if couplings[axis, _STIFFNESS] == inf:
+    if couplings[axis, STIFFNESS] == inf:
         return 0.0, torque - friction, friction, 0.0
     rate = motor_velocity - link_velocity
     passed, elastic = coupling_torques(couplings, axis, motor_angle - link_angle, rate)
-    return (torque - friction - passed) / couplings[axis, _MOTOR_INERTIA], passed, friction, (passed - elastic) * rate
+    return (torque - friction - passed) / couplings[axis, MOTOR_INERTIA], passed, friction, (passed - elastic) * rate
 
 
 @kernel
@@ -148,8 +94,8 @@ def _slopes(
     link2, link5, m11, m12, m22 = five_bar_acceleration(dynamics, closure, y[2], y[3], y[6], y[7], on2, on5)
     for i in range(4):
         slope[i] = y[i + 4]
-    slope[4] = 0.0 if is_held2 else (a2 if couplings[0, _STIFFNESS] < inf else link2)
-    slope[5] = 0.0 if is_held5 else (a5 if couplings[1, _STIFFNESS] < inf else link5)
+    slope[4] = 0.0 if is_held2 else (a2 if couplings[0, STIFFNESS] < inf else link2)
+    slope[5] = 0.0 if is_held5 else (a5 if couplings[1, STIFFNESS] < inf else link5)
     slope[6] = link2
     slope[7] = link5
     slope[_WORK] = torque2 * y[4]
@@ -168,7 +114,7 @@ def _holds(state: Float, settings: Float, couplings: Float, axis: int, torque: f
     Left to the impulse at the end of the step, a motor that is held would swing within it, light as it is, and the
     coupling's damper would feel that.
     """
-    if couplings[axis, _STIFFNESS] == inf or state[2 + axis] != 0.0:
+    if couplings[axis, STIFFNESS] == inf or state[2 + axis] != 0.0:
         return False
     passed, _ = coupling_torques(couplings, axis, state[axis] - state[_LINK + axis], -state[_LINK + 2 + axis])
     return abs(torque - passed) <= dry_friction(settings, axis, 0.0, brake)
@@ -189,9 +135,9 @@ def _motor_impulse(
         settings[axis, STOP_MINIMUM],
         settings[axis, STOP_MAXIMUM],
     )
-    if couplings[axis, _STIFFNESS] == inf:
+    if couplings[axis, STIFFNESS] == inf:
         return after, least, greatest
-    return velocity_after_impulse(couplings[axis, _MOTOR_INERTIA], after, least, greatest), 0.0, 0.0
+    return velocity_after_impulse(couplings[axis, MOTOR_INERTIA], after, least, greatest), 0.0, 0.0
 
 
 @kernel
@@ -216,7 +162,7 @@ def _settle(
 
     ``smooth``: by how much the smooth step changes each variable.
     """
-    is_flexible = couplings[axis, _STIFFNESS] < inf
+    is_flexible = couplings[axis, STIFFNESS] < inf
     before = state[2 + axis]
     change = motor - (before + smooth[4 + axis])
     link_change = link - (state[_LINK + 2 + axis] + smooth[6 + axis])
@@ -300,12 +246,12 @@ def advance_compliant(
         w2, w5 = state[_LINK + 2] + smooth[6], state[_LINK + 3] + smooth[7]
         u2, u5 = velocities_after_impulse(m11, m12, m22, w2, w5, least2, greatest2, least5, greatest5)
         impulse2, impulse5 = m11 * (u2 - w2) + m12 * (u5 - w5), m12 * (u2 - w2) + m22 * (u5 - w5)
-        if couplings[0, _STIFFNESS] < inf:
-            impulse2 = couplings[0, _MOTOR_INERTIA] * (y2 - (before2 + smooth[4]))
+        if couplings[0, STIFFNESS] < inf:
+            impulse2 = couplings[0, MOTOR_INERTIA] * (y2 - (before2 + smooth[4]))
         else:
             y2 = u2
-        if couplings[1, _STIFFNESS] < inf:
-            impulse5 = couplings[1, _MOTOR_INERTIA] * (y5 - (before5 + smooth[5]))
+        if couplings[1, STIFFNESS] < inf:
+            impulse5 = couplings[1, MOTOR_INERTIA] * (y5 - (before5 + smooth[5]))
         else:
             y5 = u5
         change2 = _settle(state, settings, couplings, 0, step_s, smooth, y2, u2)
@@ -355,7 +301,7 @@ class CompliantPlant(FiveBarPlant):
         self._constants = (
             self._dynamics,
             self._settings,
-            np.array([_row(coupling, rotor) for coupling, rotor in zip(couplings, rotors, strict=True)]),
+            np.array([coupling_row(coupling, rotor) for coupling, rotor in zip(couplings, rotors, strict=True)]),
             np.zeros((3, _VARIABLES)),
             int(parameters.closure),
             parameters.singular_sine,
@@ -407,17 +353,6 @@ class CompliantPlant(FiveBarPlant):
         counted: list[float] = self._state[first : first + ENERGY_COUNT].tolist()
         heat = float(self._state[_COUPLING_HEAT + axis])
         return energy_of(counted, self.parameters.axes[axis].motor, self.time_s, heat)
-
-
-def _row(coupling: Coupling | None, motor_inertia: float) -> tuple[float, float, float, float]:
-    if coupling is None:
-        return (inf, 0.0, 0.0, motor_inertia)
-    return (
-        coupling.stiffness_N_m_per_rad,
-        coupling.damping_N_m_s_per_rad,
-        0.5 * coupling.backlash_rad,
-        motor_inertia,
-    )
 
 
 def _on_link(rotor_inertia: float, coupling: Coupling | None) -> float:
