@@ -16,7 +16,11 @@ from torque_study import (
     wrong_model,
 )
 
+from gateway.analysis import analyse
+from gateway.cli.app import app
+from gateway.learning_file import cam_crc32
 from gateway.preparation import compile_config
+from gateway.recording import read_recording
 from gateway.sample import Phase
 
 SERVO_PEAK, SERVO_RMS, CV_PEAK = 2, 0.6, 1
@@ -123,3 +127,21 @@ def test_a_noisy_resolver_moves_the_shaft_no_farther_on_average(seed):
 def test_a_thousand_cycles_with_drifting_friction_change_nothing(cam):
     run = FastRun(configured(HEAVY, LEARNING), profile=cam, on_chunk=friction_drifting(0.1, 100_000))
     assert_reached(run.cycles(1000).worst(9))
+
+
+@pytest.mark.slow
+def test_a_run_from_the_command_line_goes_on_where_the_last_one_ended(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "machine.yaml").write_text(configured(HEAVY).text)
+    (tmp_path / "memories").mkdir()
+    firsts = []
+    for number in (1, 2):
+        recording = f"{number}.mcap"
+        options = ["--virtual-time", "--cycles", "6", "--learn", "memories", "--record", recording, "--no-frames"]
+        app(["run", "machine.yaml", *options], standalone_mode=False)
+        errors = analyse(read_recording(tmp_path / recording)).by_machine_cycle
+        firsts.append(errors.rms[0, 1])
+    assert [file.name for file in (tmp_path / "memories").iterdir()] == [
+        f"paper-{cam_crc32(compile_config(PAPER).profile):08X}.learning.json"
+    ]
+    assert firsts[1] < 0.6 * firsts[0]
