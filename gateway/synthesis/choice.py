@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from gateway.errors import UsageError
-from gateway.synthesis.run_search import SearchStatus
+from gateway.synthesis.run_search import SearchStatus, is_faulty
 from gateway.synthesis.search_slice import Found
 from mechanism.errors import CurveError
 from mechanism.synthesis.candidate import Candidate
@@ -15,7 +15,6 @@ from mechanism.synthesis.task import SynthesisTask, Term
 
 BEST: Final = "best"
 KNEE: Final = "knee"
-_FAULT_TERMS: Final = frozenset({Term.TIMING, Term.MOBILITY, Term.SINGULARITY, Term.KEEP_OUT})
 
 
 def choose(status: SearchStatus, choice: str | None, front: tuple[Found, ...], error_limit_m: float) -> Found:
@@ -50,8 +49,7 @@ def check_choice(choice: str | None, method: Method) -> None:
 
 
 def _knee(task: SynthesisTask, front: tuple[Found, ...], error_limit_m: float) -> Found:
-    faults = [index for index, entry in enumerate(task.terms) if entry.term in _FAULT_TERMS]
-    sound = [found for found in front if not any(found.terms[index] > 0.0 for index in faults)] or list(front)
+    sound = [found for found in front if not is_faulty(task, found)] or list(front)
     met = [found for found in sound if _greatest_miss(found.candidate(task), error_limit_m) <= 0.0]
     if not met:
         return min(sound, key=lambda found: _greatest_miss(found.candidate(task), error_limit_m))

@@ -40,6 +40,7 @@ _ROUNDS: Final = 8
 _GAINS_KEPT: Final = 0.05
 """A change of inertia by less is no reason to change gains."""
 _INERTIA_SAMPLES: Final = 72
+_LARGEST_GAIN: Final = 1_000_000
 _RANGE_SAMPLES: Final = 4097
 _LINKS: Final = ("p", "q", "r", "s")
 
@@ -206,8 +207,9 @@ def _settle_gains(document: Document, prepared: PreparedRun, template: GatewayCo
         if not (0.0 < factor < float("inf")) or abs(factor - 1.0) < _GAINS_KEPT:
             continue
         gains = document["axes"][name]["emulation"]["gains"]
+        factor = min(float(factor), _LARGEST_GAIN / max(*gains.values(), 1))
         for gain, value in gains.items():
-            gains[gain] = round(value * float(factor))
+            gains[gain] = int(value * factor)
         notes.append(
             f"axes.{name}: the emulated drive's gains are {factor:.3g} times the template's, as the axis' inertia is; "
             "tune a real drive anew"

@@ -28,7 +28,7 @@ DEFAULT_BUDGET: Final = {
 }
 """Evaluations a start."""
 DEFAULT_STARTS: Final = {
-    Method.PAPER: 1,
+    Method.PAPER: 8,
     Method.DIFFERENTIAL_EVOLUTION: 4,
     Method.CMA_ES: 4,
     Method.PARETO: 1,

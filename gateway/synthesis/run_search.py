@@ -14,13 +14,14 @@ from gateway.errors import UsageError
 from gateway.synthesis.search_slice import Found, SearchSlice, SliceResult
 from gateway.synthesis.workers import Workers
 from mechanism.synthesis.search import LEAST_BUDGET, Method, Phase
-from mechanism.synthesis.task import SynthesisTask
+from mechanism.synthesis.task import SynthesisTask, Term
 
 Float = NDArray[np.floating[Any]]
 
 MAXIMUM_STARTS: Final = 1024
 MAXIMUM_BUDGET: Final = 1_000_000_000
 MAXIMUM_SEED: Final = 2**32 - 1
+FAULTS: Final = frozenset({Term.TIMING, Term.MOBILITY, Term.SINGULARITY, Term.KEEP_OUT})
 _SLICES_A_START: Final = 10
 _LEAST_SLICE: Final = 200
 _POLL_S: Final = 0.2
@@ -113,9 +114,18 @@ class SearchStatus:
 
     @property
     def best_start(self) -> StartState | None:
-        """The start with the best mechanism, the first of equals; None before the first slice."""
-        begun = [start for start in self.starts if start.best is not None]
-        return min(begun, key=lambda start: start.best.objective if start.best is not None else 0.0, default=None)
+        """The start with the best mechanism, the first of equals; None before the first slice.
+
+        A mechanism that cannot move, or has another fault, is better than none without faults only: no weight of a
+        user's makes it one to build.
+        """
+        task = self.settings.task
+        ranked = [
+            (is_faulty(task, start.best), start.best.objective, index)
+            for index, start in enumerate(self.starts)
+            if start.best is not None
+        ]
+        return self.starts[min(ranked)[2]] if ranked else None
 
     @property
     def best(self) -> Found | None:
@@ -136,6 +146,11 @@ class SearchStatus:
         kept = [index for index in range(len(members)) if not _is_beaten(costs, index)]
         kept.sort(key=lambda index: (tuple(costs[index].tolist()), members[index].variables))
         return tuple(members[index] for index in kept)
+
+
+def is_faulty(task: SynthesisTask, found: Found) -> bool:
+    """Whether a mechanism cannot move, be driven, keep its order in time or out of a zone, as far as it was asked."""
+    return any(entry.term in FAULTS and value > 0.0 for entry, value in zip(task.terms, found.terms, strict=True))
 
 
 def _is_beaten(costs: Float, index: int) -> bool:

@@ -99,7 +99,7 @@ def test_a_request_becomes_a_task():
     ).settings()
     task = settings.task
     assert settings.budget == 30 * 40
-    assert settings.starts == 1
+    assert settings.starts == 8
     assert task.count == 36
     assert task.tolerances is not None
     assert task.tolerances.tolist() == pytest.approx([0.0002] * 36)

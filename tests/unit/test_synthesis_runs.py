@@ -164,6 +164,15 @@ def test_a_front_has_nobody_that_is_beaten():
     assert [found.variables for found in status.front()] == [(2.0,), (0.0,)]
 
 
+def test_a_mechanism_that_cannot_move_is_no_best_while_another_start_has_one_that_can():
+    paper = settings(method=Method.PAPER)
+    stuck, sound = Found((1.0,), (0, 27, 10, 0), 34.5), Found((2.0,), (0, 0, 80, 0), 60.0)
+    starts = (StartState(5, best=stuck), StartState(6, best=sound), StartState(7))
+    assert SearchStatus(paper, starts).best is sound
+    assert SearchStatus(paper, (starts[0], starts[2])).best is stuck
+    assert SearchStatus(paper, (starts[2],)).best is None
+
+
 def test_worker_numbers_and_addresses():
     for count, address, sentence in (
         (0, None, "--workers 0, bound 1 to 256"),
