@@ -110,7 +110,7 @@ def _ramp_steps(
     trajectory = _RUCKIG.Trajectory(1)
     try:
         result = _RUCKIG.Ruckig(1).calculate(request, trajectory)
-    except RuntimeError as error:
+    except _RUCKIG.RuckigError as error:
         reason = " ".join(str(error).split())[:80]
         raise MotionError(f"no ramp of the master from {velocity:g} to {target_velocity:g} rad/s ({reason})") from None
     if result not in (_RUCKIG.Result.Working, _RUCKIG.Result.Finished):
