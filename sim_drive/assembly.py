@@ -15,17 +15,24 @@ from config.schema import SINGULAR_SHARE, AxisSection, GatewayConfig
 from drivers.eds import describe_any_node
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
-from sim_drive.compliant import CompliantPlant
-from sim_drive.coupling import Coupling
-from sim_drive.drive import Drive
-from sim_drive.driveline import MotorParameters
-from sim_drive.energy_meter import attach_energy_meter
+from sim_drive.communication.parameter_file import make_parameter_store
+from sim_drive.device.drive import Drive
+from sim_drive.device.energy_meter import attach_energy_meter
 from sim_drive.logical_axes import MAX_AXES, eds_of_axes
 from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.node_row import describe_row
-from sim_drive.parameter_file import make_parameter_store
-from sim_drive.plant import AxisDriveline, CoupledPlant, FreeAxisParameters, FreeAxisPlant, Plant, PlantParameters
-from sim_drive.servo import DemandResolution
+from sim_drive.physics.compliant import CompliantPlant
+from sim_drive.physics.coupling import Coupling
+from sim_drive.physics.driveline import MotorParameters
+from sim_drive.physics.plant import (
+    AxisDriveline,
+    CoupledPlant,
+    FreeAxisParameters,
+    FreeAxisPlant,
+    Plant,
+    PlantParameters,
+)
+from sim_drive.physics.servo import DemandResolution
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.switches import Switches
 

@@ -25,15 +25,15 @@ from drivers.node_runner import RunStatistics
 from drivers.ports import interface_is_up, open_port
 from drivers.real_time import freeze_garbage, run_node, tighten_timers, try_realtime
 from mechanism.errors import MechanismError
-from sim_drive.faults import Fault, describe_faults
+from sim_drive.device.quirks import describe_quirks
+from sim_drive.injection.faults import Fault, describe_faults
+from sim_drive.injection.scenario import Scenario, load_scenario, parse_fault
 from sim_drive.logical_axes import MAX_AXES, eds_of_axes
-from sim_drive.quirks import describe_quirks
-from sim_drive.scenario import Scenario, load_scenario, parse_fault
 from sim_drive.settings import DriveSettings
 from sim_drive.socketcand_server import SocketcandServer
 
 if TYPE_CHECKING:
-    from sim_drive.injector import Injector
+    from sim_drive.injection.injector import Injector
     from sim_drive.machine import EmulatedMachine
 
 _EXIT_BUS: Final = 1
@@ -312,7 +312,7 @@ def _scenario(file: Path | None, words: Sequence[str], fleet: _Fleet) -> Scenari
 def _build(fleet: _Fleet, quirks: frozenset[Quirk], scenario: Scenario, seed: int) -> "EmulatedMachine | Injector":
     # Here, not above: the maths behind it takes a second to import, for which --help and errors need not wait.
     from sim_drive.assembly import FREE_AXIS_GAINS, build_machine, free_machine, settings_of_axes
-    from sim_drive.injector import Injector
+    from sim_drive.injection.injector import Injector
 
     if fleet.config is None:
         settings = settings_of_axes(DriveSettings(gains=FREE_AXIS_GAINS, quirks=quirks), fleet.axes_per_node)
@@ -340,7 +340,7 @@ def _with_quirks(config: GatewayConfig, quirks: frozenset[Quirk]) -> GatewayConf
 
 def _fault_reporter(as_json: bool) -> Callable[[Event], None]:
     """Tells of faults that begin and end, at_ns on the host's clock."""
-    from sim_drive.injector import FaultEnded, FaultStarted
+    from sim_drive.injection.injector import FaultEnded, FaultStarted
 
     def report(event: Event) -> None:
         if not isinstance(event, FaultStarted | FaultEnded):

@@ -2,7 +2,7 @@
 
 For optimisers and studies that need thousands of machine cycles: one numba kernel advances the coupled plant, runs
 eq (5) and (6) of both drives at 1024 Hz, and, at every SYNC, latches the resolvers and lets a target of cyclic
-synchronous position and a torque offset act, each exactly as `sim_drive.machine` and `sim_drive.modes.cyclic` do. The
+synchronous position and a torque offset act, exactly as the emulated machine does. The
 same set-points at the same instants give the same counts, bit for bit; a test holds the two against each other.
 
 What is left out: software position limits, brakes, faults and everything that a drive does when it is not enabled.
@@ -23,8 +23,8 @@ from mechanism.errors import ParameterError
 from mechanism.jit import kernel
 from sim_drive.assembly import build_machine
 from sim_drive.machine import TWO_SERVO_PERIODS_NS, MachineAxis
-from sim_drive.plant import SERVO_PERIOD_S, CoupledPlant, advance_five_bar
-from sim_drive.servo import GAIN_SCALE, OUTPUT_MAXIMUM, OUTPUT_MINIMUM, VOLT_PER_UNIT, DemandResolution
+from sim_drive.physics.plant import SERVO_PERIOD_S, CoupledPlant, advance_five_bar
+from sim_drive.physics.servo import GAIN_SCALE, OUTPUT_MAXIMUM, OUTPUT_MINIMUM, VOLT_PER_UNIT, DemandResolution
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -68,7 +68,7 @@ _NS_PER_S: Final = 1_000_000_000
 
 
 class PlantArguments(NamedTuple):
-    """What `sim_drive.plant.advance_five_bar` wants of a plant, apart from its state."""
+    """What `sim_drive.physics.plant.advance_five_bar` wants of a plant, apart from its state."""
 
     dynamics: Float
     settings: Float
@@ -101,7 +101,7 @@ def _demand_at(memory: Float, clock: Int, axis: int, now_ns: int) -> float:
 
 @kernel
 def _control(settings: Float, gains: Float, memory: Float, axis: int, demand_counts: float, actual: float) -> float:
-    """Torque command (N m) of eq (5) and (6) with the memory that they have: `sim_drive.servo.ServoLoop.update`."""
+    """Torque command (N m) of eq (5) and (6) with the memory that they have: `servo.ServoLoop.update`."""
     demand = floor(demand_counts + 0.5) if settings[axis, _ROUNDS_ERROR] > 0.0 else demand_counts
     demand_fed = demand if settings[axis, _ROUNDS_DIFFERENCE] > 0.0 else demand_counts
     error = demand - actual

@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 from drivers.frame import Frame
 from drivers.node import Event
 from sim_drive.machine_seam import AxisTap, DriveAxis, DriveTap, FrameHandler, Latch, MachineDrive
-from sim_drive.plant import SERVO_PERIOD_S, Plant
-from sim_drive.servo import SERVO_RATE_HZ, DemandResolution, ServoLoop
+from sim_drive.physics.plant import SERVO_PERIOD_S, Plant
+from sim_drive.physics.servo import SERVO_RATE_HZ, DemandResolution, ServoLoop
 
 TWO_SERVO_PERIODS_NS: Final = 2_000_000_000 // SERVO_RATE_HZ
 """A servo period is not a whole number of nanoseconds, but two are: 1953125 ns."""

@@ -13,7 +13,7 @@ Latch = Callable[[int], tuple[int, float, int]]
 
 
 class DriveAxis(Protocol):
-    """What the machine needs of one axis of a drive; `sim_drive.axis` has the real one."""
+    """What the machine needs of one axis of a drive; `sim_drive.device.axis` has the real one."""
 
     def measure_by(self, latch: Latch) -> None:
         """Take from ``latch`` what the axis' resolver and amplifier show at an instant."""
@@ -50,7 +50,7 @@ class DriveAxis(Protocol):
 
 
 class MachineDrive(Protocol):
-    """What the machine needs of a drive, a node of one or more axes; `sim_drive.drive` has the real one."""
+    """What the machine needs of a drive, a node of one or more axes; `sim_drive.device.drive` has the real one."""
 
     subscriptions_changed: bool
     """Set by the drive when `cob_ids` or `handler_of` has changed, reset by the machine."""

@@ -41,7 +41,7 @@ app.command("control", epilog=CONTROL_EPILOG)(control)
 
 def _show_version(is_asked: bool) -> None:
     if is_asked:
-        from gateway.recording import product_version
+        from gateway.record.recording import product_version
 
         print(f"drive-gateway {product_version()}")
         raise typer.Exit

@@ -8,12 +8,12 @@ from pathlib import Path
 from config.schema import GatewayConfig
 from drivers.master import Master, Procedure
 from drivers.real_time import run_node
-from gateway.bus_address import BusAddress
 from gateway.errors import GatewayError
-from gateway.preparation import PreparedRun, build_master, node_settings
-from gateway.procedure_core import ProcedureCore
-from gateway.recording import read_recording
-from gateway.session import StopSwitch, run_realtime
+from gateway.record.recording import read_recording
+from gateway.running.bus_address import BusAddress
+from gateway.running.preparation import PreparedRun, build_master, node_settings
+from gateway.running.procedure_core import ProcedureCore
+from gateway.running.session import StopSwitch, run_realtime
 from gateway.tuning.controller import GainPair
 from gateway.tuning.gain_download import read_gains, write_gains
 from gateway.tuning.on_machine import TrialRun, judge_trial

@@ -45,8 +45,8 @@ DOWNLOAD_EPILOG = """Examples, with an emulated machine in another terminal (sim
 def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
     """Check a configuration: its keys, the cam against every limit, the bus budget. Nothing is opened or moved."""
     from config.loading import load_config
-    from gateway.bus_budget import budget_json, budget_table, budget_verdict
-    from gateway.preparation import prepare
+    from gateway.running.bus_budget import budget_json, budget_table, budget_verdict
+    from gateway.running.preparation import prepare
 
     settings = load_config(config)
     prepared = prepare(settings, is_strict=False)
@@ -145,7 +145,7 @@ def compile_command(
 ) -> None:
     """Compile the desired curve into a cam, theta5 over theta2, and prove its limits."""
     from config.loading import load_config
-    from gateway.preparation import prepare
+    from gateway.running.preparation import prepare
     from mechanism.cam_file import cam_document, write_cam_file
 
     settings = load_config(config)
@@ -182,10 +182,10 @@ def download(
     from config.conversion import five_bar
     from config.loading import load_config
     from drivers.real_time import run_node
-    from gateway.bus_address import resolve_bus
-    from gateway.download import DownloadResult, download_image
-    from gateway.preparation import axis_units, build_master, node_settings
-    from gateway.procedure_core import ProcedureCore
+    from gateway.running.bus_address import resolve_bus
+    from gateway.running.download import DownloadResult, download_image
+    from gateway.running.preparation import axis_units, build_master, node_settings
+    from gateway.running.procedure_core import ProcedureCore
     from mechanism.cam_file import read_cam_file
     from mechanism.cam_image import encode_cam_image
 

@@ -28,7 +28,7 @@ def compare(
     """Put recorded runs side by side: errors and torque of each at constant speed, and in its last machine cycle."""
     from rich.table import Table
 
-    from gateway.comparison import compare_runs, comparison_png
+    from gateway.reporting.comparison import compare_runs, comparison_png
 
     if plot is not None:
         require_absent(plot, is_overwriting)

@@ -41,8 +41,8 @@ def control(
 ) -> None:
     """Change the speed of a running machine, jog it, shift its phase, or take the slave off its cam and back."""
     from config.loading import load_config
-    from gateway.control import send_order
-    from gateway.operation import Order
+    from gateway.cyclic.operation import Order
+    from gateway.running.control import send_order
 
     answer = send_order(load_config(config).name, Order[order.name], value)
     if as_json:

@@ -29,8 +29,8 @@ def doctor(
     as_json: JsonOption = False,
 ) -> None:
     """Look at what this machine offers a cyclic loop, and at its CAN interfaces; say what would help."""
-    from gateway.bus_address import resolve_bus
-    from gateway.doctor import Wanted, examine, findings_json, is_ready
+    from gateway.running.bus_address import resolve_bus
+    from gateway.running.doctor import Wanted, examine, findings_json, is_ready
 
     wanted = Wanted(channel)
     if config is not None:

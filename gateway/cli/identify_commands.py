@@ -22,10 +22,10 @@ from gateway.cli.terminal import (
 
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
-    from gateway.bus_address import BusAddress
     from gateway.identification.fit import Identification
-    from gateway.preparation import PreparedRun
-    from gateway.recording import Recording
+    from gateway.record.recording import Recording
+    from gateway.running.bus_address import BusAddress
+    from gateway.running.preparation import PreparedRun
 
 IDENTIFY_EPILOG = """Examples:
 
@@ -66,12 +66,12 @@ def identify_command(
     """Estimate inertia, gravity and friction of the machine, with 95 % intervals, from recordings or an excitation."""
     from config.conversion import nominal_parameters
     from config.loading import load_config, parse_config
-    from gateway.bus_address import resolve_bus
     from gateway.errors import UsageError
     from gateway.identification.fit import DEFAULT_TORQUE_DELAY_S, identify, motion_of
     from gateway.identification.model_file import model_text
     from gateway.identification.plot import fit_png
-    from gateway.recording import read_recording
+    from gateway.record.recording import read_recording
+    from gateway.running.bus_address import resolve_bus
     from mechanism.five_bar import Closure
 
     for path in (output, plot):
@@ -110,7 +110,7 @@ def _excite(
 ) -> "list[Recording]":
     """Run the excitation; the recordings are read and not kept."""
     from gateway.identification.excitation import excitation_runs
-    from gateway.recording import read_recording
+    from gateway.record.recording import read_recording
 
     runs = excitation_runs(config, cycles) * repeats
     console = messages()
@@ -129,8 +129,8 @@ def _excite(
 
 
 def _run(prepared: "PreparedRun", address: "BusAddress | None", path: Path, seed: int) -> None:
-    from gateway.session import StopSwitch, run_realtime
-    from gateway.virtual_run import run_virtual
+    from gateway.running.session import StopSwitch, run_realtime
+    from gateway.running.virtual_run import run_virtual
     from mechanism.cam_file import cam_document
     from sim_drive.assembly import build_machine
 
@@ -146,8 +146,8 @@ def _run(prepared: "PreparedRun", address: "BusAddress | None", path: Path, seed
 
 
 def _completed(read: "Recording") -> "Recording":
+    from gateway.cyclic.guard import StopReason
     from gateway.errors import GatewayError
-    from gateway.guard import StopReason
 
     if read.stopped_by != StopReason.COMPLETED.value:
         raise GatewayError(f"the excitation did not complete, it was stopped by: {read.stopped_by}")

@@ -12,9 +12,9 @@ from gateway.cli.terminal import messages, print_json, results
 if TYPE_CHECKING:
     from config.gain_sets import GainSet
     from config.schema import GatewayConfig
-    from gateway.paper_comparison import FirstCycle, TorqueDemand, TunedRun
-    from gateway.paper_figures import ServoTicks
-    from gateway.preparation import PreparedRun
+    from gateway.reporting.paper_comparison import FirstCycle, TorqueDemand, TunedRun
+    from gateway.reporting.paper_figures import ServoTicks
+    from gateway.running.preparation import PreparedRun
     from sim_drive.machine import EmulatedMachine
 
 LEAST_CYCLES: Final = 2
@@ -32,8 +32,8 @@ def paper_demo(
     ``run`` carries out a prepared run with a machine in virtual time, and records it in ``output``.
     """
     from config.gain_sets import load_gain_sets
-    from gateway.paper_comparison import compare, to_markdown, to_table
-    from gateway.paper_plot import plot_reproduction
+    from gateway.reporting.paper_comparison import compare, to_markdown, to_table
+    from gateway.reporting.paper_plot import plot_reproduction
 
     console = messages()
     runs: list[TunedRun] = []
@@ -68,12 +68,12 @@ def _run_tuning(
     """A tuning's figures, its servo ticks, and which of them are the last machine cycle at full speed."""
     from config.gain_sets import with_gain_set
     from gateway.errors import GatewayError
-    from gateway.paper_comparison import TunedRun
-    from gateway.paper_figures import reproduce
-    from gateway.preparation import prepare
+    from gateway.reporting.paper_comparison import TunedRun
+    from gateway.reporting.paper_figures import reproduce
+    from gateway.running.preparation import prepare
     from mechanism.cam_file import cam_document
     from sim_drive.assembly import build_machine
-    from sim_drive.plant import SERVO_PERIOD_S
+    from sim_drive.physics.plant import SERVO_PERIOD_S
 
     tuned = with_gain_set(config, gains)
     prepared = prepare(tuned, max(cycles, LEAST_CYCLES))
@@ -103,7 +103,7 @@ def _run_tuning(
 
 
 def _ticks_of(machine: "EmulatedMachine", counts_per_revolution: int) -> "ServoTicks":
-    from gateway.paper_figures import ServoTicks
+    from gateway.reporting.paper_figures import ServoTicks
 
     records = machine.records
     return ServoTicks(
@@ -117,7 +117,7 @@ def _ticks_of(machine: "EmulatedMachine", counts_per_revolution: int) -> "ServoT
 
 def _started_at_once(config: "GatewayConfig", prepared: "PreparedRun") -> "ServoTicks":
     """The first revolution and a little more, its demand at full speed from the first SYNC on."""
-    from gateway.paper_figures import ServoTicks
+    from gateway.reporting.paper_figures import ServoTicks
     from sim_drive.closed_loop import closed_loop_of
 
     loop = closed_loop_of(config)
@@ -137,7 +137,7 @@ def _started_at_once(config: "GatewayConfig", prepared: "PreparedRun") -> "Servo
 
 
 def _first_cycle(ticks: "ServoTicks") -> "FirstCycle":
-    from gateway.paper_comparison import FirstCycle
+    from gateway.reporting.paper_comparison import FirstCycle
 
     errors = ticks.errors[ticks.between(0.0, 1.0)]
     master, slave = (float(errors[int(np.argmax(np.abs(errors[:, axis]))), axis]) for axis in (0, 1))
@@ -146,8 +146,8 @@ def _first_cycle(ticks: "ServoTicks") -> "FirstCycle":
 
 def _required_torque(config: "GatewayConfig") -> "tuple[TorqueDemand, TorqueDemand]":
     from config.conversion import dynamics_parameters
-    from gateway.paper_comparison import TorqueDemand
-    from gateway.preparation import compile_config
+    from gateway.reporting.paper_comparison import TorqueDemand
+    from gateway.running.preparation import compile_config
     from mechanism.dynamics import inverse_dynamics_along
 
     cam = compile_config(config)

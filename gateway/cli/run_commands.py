@@ -29,11 +29,11 @@ from gateway.cli.terminal import (
 
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
-    from gateway.bus_address import BusAddress
     from gateway.cli.paper_demo import VirtualRunner
-    from gateway.learning_store import LearningStore
-    from gateway.preparation import PreparedRun
-    from gateway.recording import Recording
+    from gateway.record.recording import Recording
+    from gateway.running.bus_address import BusAddress
+    from gateway.running.learning_store import LearningStore
+    from gateway.running.preparation import PreparedRun
     from sim_drive.machine import EmulatedMachine
 
 RUN_EPILOG = """Examples:
@@ -85,7 +85,7 @@ def _progress() -> Generator[tuple[Progress, Any]]:
 
 
 def _prepare(config: "GatewayConfig", cycles: int | None) -> "tuple[PreparedRun, str]":
-    from gateway.preparation import prepare
+    from gateway.running.preparation import prepare
     from mechanism.cam_file import cam_document
 
     prepared = prepare(config, cycles)
@@ -104,8 +104,8 @@ def _run_on_bus(
     learn: Path | None = None,
     is_starting_anywhere: bool = False,
 ) -> None:
-    from gateway.session import Progress as RunProgress
-    from gateway.session import StopSwitch, run_realtime
+    from gateway.running.session import Progress as RunProgress
+    from gateway.running.session import StopSwitch, run_realtime
 
     switch = StopSwitch()
     console = messages()
@@ -163,10 +163,10 @@ def _run_virtually(
     machine: "EmulatedMachine | None" = None,
 ) -> float:
     """Carry out the run in virtual time; returns machine seconds per second. ``machine``: not the configuration's."""
-    from gateway.core import GatewayCore
-    from gateway.cyclic_process import pass_on_stop
-    from gateway.session import StopSwitch
-    from gateway.virtual_run import run_virtual
+    from gateway.running.core import GatewayCore
+    from gateway.running.cyclic_process import pass_on_stop
+    from gateway.running.session import StopSwitch
+    from gateway.running.virtual_run import run_virtual
     from sim_drive.assembly import build_machine
 
     if machine is None:
@@ -209,7 +209,7 @@ def _run_virtually(
 
 def _where_the_machine_stands(read: "Recording") -> str:
     """Angles of the axes at a recording's end; nothing if they never left home."""
-    from gateway.analysis import prepare
+    from gateway.reporting.analysis import prepare
 
     data = prepare(read.samples, read.constants)
     if not data.is_following.any():
@@ -223,11 +223,11 @@ def _show(recording: Path, as_json: bool, report_folder: Path | None, is_machine
 
     ``is_machine_left``: the machine stays where the run left it, and the next run must not take that for home.
     """
-    from gateway.analysis import analyse
-    from gateway.guard import StopReason
-    from gateway.recording import read_recording
-    from gateway.report import write_report
-    from gateway.report_text import render_report
+    from gateway.cyclic.guard import StopReason
+    from gateway.record.recording import read_recording
+    from gateway.reporting.analysis import analyse
+    from gateway.reporting.report import write_report
+    from gateway.reporting.report_text import render_report
 
     read = read_recording(recording)
     if not len(read.samples):
@@ -290,8 +290,8 @@ def run(
 ) -> None:
     """Commission the drives, ramp up, run the machine cycles on the cam, ramp down, disable; record and report it."""
     from config.loading import load_config
-    from gateway.bus_address import resolve_bus
-    from gateway.learning_store import open_store
+    from gateway.running.bus_address import resolve_bus
+    from gateway.running.learning_store import open_store
 
     settings = load_config(config)
     recording = record or Path(f"{settings.name}-{time.strftime('%Y%m%d-%H%M%S')}.mcap")
@@ -326,7 +326,7 @@ def demo(
     from config.loading import load_config
     from gateway.cli.paper_demo import paper_demo
     from gateway.errors import UsageError
-    from gateway.session import emulator_process
+    from gateway.running.session import emulator_process
     from mechanism.cam_file import write_cam_file
 
     settings = load_config("paper")

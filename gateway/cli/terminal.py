@@ -68,7 +68,7 @@ def errors_answered() -> Generator[None]:
     from config.loading import ConfigError
     from drivers.errors import DriveError
     from gateway.errors import GatewayError, UsageError
-    from gateway.ring import RingError
+    from gateway.record.ring import RingError
     from mechanism.errors import CamFileError, CurveError, MechanismError, ParameterError
 
     try:

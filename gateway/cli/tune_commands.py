@@ -26,9 +26,9 @@ from gateway.cli.terminal import (
 
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
-    from gateway.bus_address import BusAddress
-    from gateway.preparation import PreparedRun
-    from gateway.session import StopSwitch
+    from gateway.running.bus_address import BusAddress
+    from gateway.running.preparation import PreparedRun
+    from gateway.running.session import StopSwitch
     from gateway.tuning.controller import GainPair
     from gateway.tuning.margins import LoopModel
     from gateway.tuning.on_machine import MachineTuning, TrialRun
@@ -69,7 +69,7 @@ class _Bench:
 
 
 def _bench(config: "GatewayConfig") -> _Bench:
-    from gateway.preparation import compile_config
+    from gateway.running.preparation import compile_config
     from gateway.tuning.margins import loop_model
     from gateway.tuning.steady_cycle import SteadyCycle
     from sim_drive.closed_loop import closed_loop_of
@@ -110,7 +110,7 @@ def _search_bar(switch: "StopSwitch") -> "Generator[Callable[[SearchProgress], N
 
 
 def _search(bench: _Bench, present: "GainPair", evaluations: int, seed: int) -> "tuple[Tuning, int]":
-    from gateway.session import StopSwitch
+    from gateway.running.session import StopSwitch
     from gateway.tuning.controller import Gains
     from gateway.tuning.search import GainSearch, TuningGoals, gains_of, search_gains
 
@@ -241,8 +241,8 @@ def tune(
 ) -> None:
     """Find gains of both axes together under bounds on their margins; write them back, on request into the drives."""
     from config.loading import load_config
-    from gateway.bus_address import resolve_bus
     from gateway.errors import GatewayError
+    from gateway.running.bus_address import resolve_bus
     from gateway.tuning.controller import Gains
 
     settings = load_config(config)
@@ -325,8 +325,8 @@ def _try_on_machine(
     config: "GatewayConfig", wanted: "GainPair", address: "BusAddress | None", seed: int
 ) -> "MachineTuning":
     from gateway.cli.bus_machine import BusMachine
-    from gateway.preparation import prepare
-    from gateway.session import StopSwitch
+    from gateway.running.preparation import prepare
+    from gateway.running.session import StopSwitch
     from gateway.tuning.on_machine import VirtualTimeMachine, trial_config, tune_on_machine
     from gateway.tuning.search import TuningGoals
 

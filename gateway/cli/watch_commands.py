@@ -32,11 +32,11 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Make the report of a recording: tables here, report.html, report.json and plots in DIR."""
-    from gateway.analysis import analyse
     from gateway.errors import GatewayError
-    from gateway.recording import read_recording, write_candump_log
-    from gateway.report import write_report
-    from gateway.report_text import render_report
+    from gateway.record.recording import read_recording, write_candump_log
+    from gateway.reporting.analysis import analyse
+    from gateway.reporting.report import write_report
+    from gateway.reporting.report_text import render_report
 
     read = read_recording(recording)
     figures = analyse(read)
@@ -63,6 +63,6 @@ def monitor_command(
 ) -> None:
     """Attach to a running gateway and show the axis errors live. It only reads, and never slows the cycle."""
     from config.loading import load_config
-    from gateway.monitor import monitor
+    from gateway.reporting.monitor import monitor
 
     monitor(load_config(config).name, once=once, as_json=as_json, console=results())

@@ -11,7 +11,7 @@ import yaml
 from config.loading import ConfigError, parse_config
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError
-from gateway.preparation import PreparedRun, prepare
+from gateway.running.preparation import PreparedRun, prepare
 
 SPEED_SHARES: Final = (0.5, 0.75, 1.0)
 """Of the configured speed, which is never exceeded."""

@@ -4,8 +4,8 @@ from typing import Final
 
 import numpy as np
 
-from gateway.figure import Figure, Theme, new_figure, render_png
 from gateway.identification.fit import Identification
+from gateway.reporting.figure import Figure, Theme, new_figure, render_png
 
 _SIZE_INCHES: Final = (10.5, 6.5)
 

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from gateway.errors import UsageError
-from gateway.figure import PNG_THEME, Axes, Figure, figure_style, legend, new_figure
+from gateway.reporting.figure import PNG_THEME, Axes, Figure, figure_style, legend, new_figure
 from gateway.synthesis.linkage_motion import LinkageMotion
 
 _mpl: Any = matplotlib

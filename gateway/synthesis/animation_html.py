@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.report_page import STYLE
+from gateway.reporting.report_page import STYLE
 from gateway.synthesis.linkage_motion import LinkageMotion
 
 Float = NDArray[np.floating[Any]]

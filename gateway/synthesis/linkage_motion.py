@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from config.conversion import desired_curve, dynamics_parameters, five_bar
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError, UsageError
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from mechanism.cam import Cam
 from mechanism.curve import DesiredCurve
 from mechanism.dynamics import inverse_dynamics_along

@@ -18,7 +18,7 @@ from config.conversion import dynamics_parameters, five_bar
 from config.loading import ConfigError, parse_config
 from config.schema import GatewayConfig, LinkSection
 from gateway.errors import GatewayError
-from gateway.preparation import PreparedRun, compile_config, prepare
+from gateway.running.preparation import PreparedRun, compile_config, prepare
 from mechanism.cam import Cam
 from mechanism.cam_profile import CamProfile
 from mechanism.closure import ClosureTrack

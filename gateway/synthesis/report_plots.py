@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.figure import (
+from gateway.reporting.figure import (
     Axes,
     Figure,
     Theme,

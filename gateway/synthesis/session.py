@@ -8,7 +8,7 @@ from typing import Any
 
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError
-from gateway.session import StopRequest, StopSwitch
+from gateway.running.session import StopRequest, StopSwitch
 from gateway.synthesis.choice import choose, missed_tolerance
 from gateway.synthesis.linkage_motion import LinkageMotion, linkage_motion
 from gateway.synthesis.machine_files import MachineFiles, write_machine

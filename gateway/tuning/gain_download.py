@@ -8,8 +8,8 @@ from drivers import objects
 from drivers.errors import NodeError
 from drivers.master import Master, Procedure
 from drivers.object_dictionary import DataType
-from gateway.commissioning import NodeSettings, check_identity
 from gateway.errors import GatewayError
+from gateway.running.commissioning import NodeSettings, check_identity
 from gateway.tuning.controller import GAIN_NAMES, GainPair, Gains
 
 _I32: Final = DataType.INTEGER32

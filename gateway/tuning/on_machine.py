@@ -20,12 +20,12 @@ from drivers.errors import DriveError
 from drivers.master import Master, Procedure
 from drivers.node import Node
 from drivers.virtual_time import VirtualBus
-from gateway.analysis import FOLLOWING_PHASES
+from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
-from gateway.guard import StopReason
-from gateway.preparation import PreparedRun, build_core, build_master, node_settings
-from gateway.procedure_core import ProcedureCore
-from gateway.sample import Phase, SampleArray, SampleLayout
+from gateway.record.sample import Phase, SampleArray, SampleLayout
+from gateway.reporting.analysis import FOLLOWING_PHASES
+from gateway.running.preparation import PreparedRun, build_core, build_master, node_settings
+from gateway.running.procedure_core import ProcedureCore
 from gateway.tuning.controller import GainPair, Gains
 from gateway.tuning.gain_download import read_gains, write_gains
 
@@ -197,7 +197,7 @@ class _Samples:
         self._packed = bytearray()
 
     def append(self, *values: float) -> None:
-        """See ``gateway.cycle.SampleSink``."""
+        """See ``gateway.cyclic.cycle.SampleSink``."""
         self._packed += self._layout.pack(*values)
 
     def array(self) -> SampleArray:

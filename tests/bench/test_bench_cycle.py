@@ -17,9 +17,9 @@ from config.loading import load_config
 from drivers.frame import Frame
 from drivers.python_can_port import PythonCanPort
 from drivers.virtual_time import VirtualBus
-from gateway.core import GatewayCore
-from gateway.preparation import build_core, prepare
-from gateway.sample import Phase, SampleLayout
+from gateway.record.sample import Phase, SampleLayout
+from gateway.running.core import GatewayCore
+from gateway.running.preparation import build_core, prepare
 from sim_drive.assembly import build_machine
 
 pytestmark = pytest.mark.bench

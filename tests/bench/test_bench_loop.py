@@ -19,9 +19,9 @@ from test_bench_cycle import CONFIG, NODE_IDS, Call, PackingSink, calls, map_pdo
 
 from drivers.frame import Frame
 from drivers.socketcan_port import CAN_FRAME, SocketcanPort
-from gateway.cycle import AxisChannel, CyclicLoop
-from gateway.guard import Guard
-from gateway.sample import MAX_AXES, SampleLayout
+from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.guard import Guard
+from gateway.record.sample import MAX_AXES, SampleLayout
 from gateway.units import AxisUnits
 
 pytestmark = pytest.mark.bench

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "virtual"))
 from guarded_machine import CV, PAPER, SERVO, at_theta2
 from test_guard_lost_axis import IDLE, lose
 
-from sim_drive.faults import FaultKind
+from sim_drive.injection.faults import FaultKind
 
 
 @pytest.mark.bench

@@ -10,8 +10,8 @@ from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
 from sim_drive.assembly import free_machine
-from sim_drive.faults import Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.injection.faults import Fault, FaultKind
+from sim_drive.injection.injector import Injector
 
 pytestmark = pytest.mark.bench
 

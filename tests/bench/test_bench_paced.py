@@ -26,7 +26,7 @@ from test_bench_loop import EDS, TPDO, LoopbackBus, canned
 from drivers.frame import Frame
 from drivers.real_time import tighten_timers
 from drivers.socketcan_port import CAN_FRAME, SocketcanPort
-from gateway.cycle_host import CycleHost
+from gateway.running.cycle_host import CycleHost
 
 pytestmark = pytest.mark.bench
 __all__ = ["calls"]

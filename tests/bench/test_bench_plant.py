@@ -10,10 +10,10 @@ import pytest
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters
 from config.loading import load_config
 from mechanism.jit import kernel
-from sim_drive.compliant import CompliantPlant, advance_compliant
-from sim_drive.coupling import Coupling
-from sim_drive.five_bar_motion import MOTION_SIZE, advance_five_bar
-from sim_drive.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.physics.compliant import CompliantPlant, advance_compliant
+from sim_drive.physics.coupling import Coupling
+from sim_drive.physics.five_bar_motion import MOTION_SIZE, advance_five_bar
+from sim_drive.physics.plant import AxisDriveline, CoupledPlant, PlantParameters
 
 PERIODS = 20_000
 OFF = (False, False)

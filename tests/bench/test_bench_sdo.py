@@ -12,8 +12,8 @@ from drivers.eds import load_eds
 from drivers.errors import SdoAbortedError
 from drivers.master import Master
 from drivers.virtual_time import VirtualBus
-from gateway.procedure_core import ProcedureCore
-from sim_drive.drive import Drive
+from gateway.running.procedure_core import ProcedureCore
+from sim_drive.device.drive import Drive
 from sim_drive.settings import DriveSettings
 
 pytestmark = pytest.mark.bench

@@ -9,10 +9,10 @@ import time
 import pytest
 from torque_study import MIXES, PAPER, FastRun, configured, friction_drifting, scaled_cam, wrong_model
 
-from gateway.demand import CamDemand
-from gateway.learning import build_learning
-from gateway.preparation import axis_units, compile_config
-from gateway.torque_offsets import build_torque_offsets
+from gateway.cyclic.demand import CamDemand
+from gateway.cyclic.torque_offsets import build_torque_offsets
+from gateway.learning.law import build_learning
+from gateway.running.preparation import axis_units, compile_config
 from mechanism.motion import plan_run
 
 pytestmark = pytest.mark.bench

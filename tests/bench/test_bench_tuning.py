@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from config.loading import load_config
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from gateway.tuning.controller import Gains
 from gateway.tuning.margins import gain_array, loop_model, robustness
 from gateway.tuning.search import GainSearch, TuningGoals

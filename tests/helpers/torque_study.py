@@ -11,11 +11,11 @@ import numpy as np
 from config.loading import load_config, parse_config
 from config.schema import GatewayConfig
 from drivers.virtual_time import VirtualBus
-from gateway.demand import CamDemand
-from gateway.learning import LearnedTorque, build_learning
-from gateway.preparation import axis_units, build_core, compile_config, prepare
-from gateway.sample import Phase, SampleLayout
-from gateway.torque_offsets import build_torque_offsets
+from gateway.cyclic.demand import CamDemand
+from gateway.cyclic.torque_offsets import build_torque_offsets
+from gateway.learning.law import LearnedTorque, build_learning
+from gateway.record.sample import Phase, SampleLayout
+from gateway.running.preparation import axis_units, build_core, compile_config, prepare
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import MasterPlan, plan_run
 from sim_drive.assembly import build_machine

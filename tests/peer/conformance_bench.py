@@ -14,10 +14,10 @@ from drivers.frame import Frame
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.cam_image import decode_cam_image
 from sim_drive.assembly import FREE_AXIS, FREE_AXIS_GAINS, SHIPPED_EDS
-from sim_drive.drive import Drive
+from sim_drive.device.drive import Drive
 from sim_drive.logical_axes import eds_of_axes
 from sim_drive.machine import EmulatedMachine, MachineAxis
-from sim_drive.plant import FreeAxisPlant
+from sim_drive.physics.plant import FreeAxisPlant
 from sim_drive.settings import DriveSettings
 
 MS = 1_000_000

@@ -16,12 +16,12 @@ from drivers.frame import Frame
 from drivers.master import Master, Procedure
 from drivers.object_dictionary import DataType
 from drivers.virtual_time import VirtualBus
-from gateway.download import download_image
-from gateway.preparation import build_master, node_settings, prepare
-from gateway.procedure_core import ProcedureCore
-from gateway.recording import read_recording, write_candump_log
-from gateway.ring import FRAME_DTYPE, FrameArray
-from gateway.virtual_run import run_virtual
+from gateway.record.recording import read_recording, write_candump_log
+from gateway.record.ring import FRAME_DTYPE, FrameArray
+from gateway.running.download import download_image
+from gateway.running.preparation import build_master, node_settings, prepare
+from gateway.running.procedure_core import ProcedureCore
+from gateway.running.virtual_run import run_virtual
 from mechanism.cam_image import encode_cam_image
 from sim_drive.assembly import build_machine
 

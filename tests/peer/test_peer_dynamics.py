@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from config.conversion import closure_at_home, desired_curve, dynamics_parameters
 from config.loading import load_config
 from config.schema import GatewayConfig
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from mechanism.dynamics import acceleration, energy, friction_torque, inverse_dynamics
 from mechanism.five_bar import Closure
 

@@ -14,8 +14,8 @@ import pytest
 from drivers.eds import describe_any_node
 from drivers.frame import Frame
 from drivers.object_dictionary import ObjectDictionary
-from sim_drive.drive import UNCONFIGURED_NODE_ID, Drive
-from sim_drive.parameters import MemoryParameterStore
+from sim_drive.communication.parameters import MemoryParameterStore
+from sim_drive.device.drive import UNCONFIGURED_NODE_ID, Drive
 from sim_drive.settings import DriveIdentity, DriveSettings
 
 EDS = Path(__file__).resolve().parents[2] / "config" / "eds" / "sim_drive.eds"

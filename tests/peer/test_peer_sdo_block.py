@@ -24,8 +24,8 @@ from drivers.frame import Frame
 from drivers.master import Master, Procedure
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
-from gateway.procedure_core import ProcedureCore
-from sim_drive.drive import Drive
+from gateway.running.procedure_core import ProcedureCore
+from sim_drive.device.drive import Drive
 from sim_drive.settings import DriveSettings
 
 NODE = 5

@@ -35,8 +35,8 @@ from drivers.node import Event, Node
 from drivers.object_dictionary import DataType
 from drivers.pdo import MappingEntry
 from drivers.virtual_time import VirtualBus
-from gateway.commissioning import map_pdo
-from gateway.procedure_core import ProcedureCore
+from gateway.running.commissioning import map_pdo
+from gateway.running.procedure_core import ProcedureCore
 
 T = TypeVar("T")
 NODE = 5

@@ -11,10 +11,10 @@ from drivers.eds import describe_any_node
 from drivers.frame import Frame
 from drivers.master import Master, Procedure
 from drivers.virtual_time import VirtualBus
-from gateway.procedure_core import ProcedureCore
-from gateway.recording import write_candump_log
-from gateway.ring import FRAME_DTYPE
-from sim_drive.drive import UNCONFIGURED_NODE_ID, Drive
+from gateway.record.recording import write_candump_log
+from gateway.record.ring import FRAME_DTYPE
+from gateway.running.procedure_core import ProcedureCore
+from sim_drive.device.drive import UNCONFIGURED_NODE_ID, Drive
 from sim_drive.settings import DriveIdentity, DriveSettings
 
 NODE = 5

@@ -9,10 +9,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from gateway.recording import RecordingMetadata, RecordingWriter
-from gateway.ring import FRAME_DTYPE
-from gateway.run_constants import AxisConstants, RunConstants
-from gateway.sample import Phase, SampleFlag, SampleLayout
+from gateway.record.recording import RecordingMetadata, RecordingWriter
+from gateway.record.ring import FRAME_DTYPE
+from gateway.record.run_constants import AxisConstants, RunConstants
+from gateway.record.sample import Phase, SampleFlag, SampleLayout
 
 TWO_AXES = RunConstants("peer", 0.001, (AxisConstants("cv", 4096, 1.5), AxisConstants("servo", 4096, 0.5)))
 

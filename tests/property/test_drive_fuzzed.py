@@ -13,9 +13,9 @@ from drivers.eds import load_eds
 from drivers.frame import Frame
 from drivers.object_dictionary import ObjectDictionary
 from mechanism.errors import CamFileError
-from sim_drive.cam_slots import CamTable
-from sim_drive.cia402 import PowerState
-from sim_drive.drive import Drive, DriveSettings
+from sim_drive.device.cam_slots import CamTable
+from sim_drive.device.cia402 import PowerState
+from sim_drive.device.drive import Drive, DriveSettings
 
 NODE = 5
 EDS = Path(__file__).parents[2] / "config" / "eds" / "sim_drive.eds"

@@ -14,11 +14,11 @@ from config.loading import load_config
 from drivers.eds import load_eds
 from drivers.frame import Frame
 from drivers.nmt import NmtState
-from gateway.preparation import prepare
-from gateway.recording import read_recording
-from gateway.virtual_run import run_virtual
+from gateway.record.recording import read_recording
+from gateway.running.preparation import prepare
+from gateway.running.virtual_run import run_virtual
 from sim_drive.assembly import SHIPPED_EDS, build_machine, free_machine
-from sim_drive.cia402 import PowerStateChanged
+from sim_drive.device.cia402 import PowerStateChanged
 
 NODES = (1, 2)
 ROUND = 500

@@ -11,9 +11,9 @@ from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
 from sim_drive.assembly import free_machine
-from sim_drive.drive import Drive
-from sim_drive.faults import FAULTS, Direction, Fault, FaultKind
-from sim_drive.injector import FaultEnded, FaultStarted, Injector
+from sim_drive.device.drive import Drive
+from sim_drive.injection.faults import FAULTS, Direction, Fault, FaultKind
+from sim_drive.injection.injector import FaultEnded, FaultStarted, Injector
 
 SECOND = 1_000_000_000
 NODES = (5, 9)

@@ -6,8 +6,8 @@ from pathlib import Path
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gateway.ring import RingReader, RingWriter
-from gateway.run_constants import AxisConstants, RunConstants
+from gateway.record.ring import RingReader, RingWriter
+from gateway.record.run_constants import AxisConstants, RunConstants
 
 CONSTANTS = RunConstants("property", 0.001, (AxisConstants("only", 4096, 1.0),))
 REST = (0, 0.0, 0.0, 0.0, *[0] * 8, *[0] * 5)

@@ -5,11 +5,11 @@ from functools import cache
 
 from config.conversion import dynamics_parameters
 from config.loading import load_config
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from mechanism.cam import CompiledCam
 from mechanism.dynamics import DynamicsParameters
-from sim_drive.driveline import SERVO_PERIOD_S
-from sim_drive.plant import Plant
+from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.physics.plant import Plant
 
 PERIODS_IN_CYCLE = 1024
 OFF = (False, False)

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gateway.run_constants import AxisConstants, MechanismConstants, RunConstants
-from gateway.sample import Phase, SampleArray, SampleLayout
+from gateway.record.run_constants import AxisConstants, MechanismConstants, RunConstants
+from gateway.record.sample import Phase, SampleArray, SampleLayout
 
 PAPER_MECHANISM = MechanismConstants(
     p_m=0.150, q_m=0.250, r_m=0.300, s_m=0.150, cv_pivot_m=(0.0, 0.0), servo_pivot_m=(0.250, 0.0), closure=1

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 
-from gateway.analysis import SMOOTHING_CYCLES, RunReport, prepare, report_of
-from gateway.report_text import number
-from gateway.sample import Phase, SampleArray, SampleFlag, missed_tpdo_flag
+from gateway.record.sample import Phase, SampleArray, SampleFlag, missed_tpdo_flag
+from gateway.reporting.analysis import SMOOTHING_CYCLES, RunReport, prepare, report_of
+from gateway.reporting.report_text import number
 
 
 def report(samples: SampleArray) -> RunReport:

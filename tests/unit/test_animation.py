@@ -15,7 +15,7 @@ from PIL import Image
 from config.loading import load_config, parse_config
 from gateway.cli import main
 from gateway.errors import UsageError
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from gateway.synthesis.animation_gif import gif_of
 from gateway.synthesis.animation_html import html_of
 from gateway.synthesis.linkage_motion import linkage_motion

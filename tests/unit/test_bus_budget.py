@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 from config.bus_budget import bus_budget, deadline_without_wire_us, representable_cycle_us
 from config.loading import ConfigError, load_config, parse_config
 from drivers.frame import Frame
-from gateway.bus_address import BusAddress
-from gateway.bus_budget import budget_json, has_wire, require_budget
 from gateway.cli.cam_commands import check
+from gateway.cyclic.sdo_pacing import SdoPacing
 from gateway.errors import GatewayError
-from gateway.preparation import build_core, prepare
-from gateway.sdo_pacing import SdoPacing
+from gateway.running.bus_address import BusAddress
+from gateway.running.bus_budget import budget_json, has_wire, require_budget
+from gateway.running.preparation import build_core, prepare
 
 CONFIG = load_config("paper")
 

@@ -5,10 +5,10 @@ import math
 import pytest
 
 from config.loading import load_config
-from gateway.axis_channel import AxisChannel
-from gateway.guard import Guard
-from gateway.preparation import axis_units, compile_config
-from gateway.reactions import CoupledStop
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.guard import Guard
+from gateway.cyclic.reactions import CoupledStop
+from gateway.running.preparation import axis_units, compile_config
 
 CONFIG = load_config("paper")
 PROFILE = compile_config(CONFIG).profile

@@ -9,10 +9,10 @@ import pytest
 from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 from rich.console import Console
 
-from gateway.analysis import prepare, report_of
-from gateway.cycle_errors import MOST_LISTED, CycleErrors, cycle_errors
-from gateway.report_text import render_report
-from gateway.sample import Phase, missed_tpdo_flag
+from gateway.record.sample import Phase, missed_tpdo_flag
+from gateway.reporting.analysis import prepare, report_of
+from gateway.reporting.cycle_errors import MOST_LISTED, CycleErrors, cycle_errors
+from gateway.reporting.report_text import render_report
 
 
 def errors_of(samples):

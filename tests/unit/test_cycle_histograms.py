@@ -5,8 +5,8 @@ import pytest
 from hdrh.histogram import HdrHistogram
 from recording_samples import LAYOUT, steady_run
 
-from gateway.histograms import CycleCounts, CycleHistograms, Timing, count_cycles
-from gateway.sample import SampleFlag
+from gateway.record.histograms import CycleCounts, CycleHistograms, Timing, count_cycles
+from gateway.record.sample import SampleFlag
 
 
 def test_percentiles_are_those_of_the_samples_to_three_digits():

@@ -9,13 +9,13 @@ from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.real_time import isolated_processors
-from gateway import cycle_bus
-from gateway.bus_address import BusAddress
-from gateway.cycle_bus import open_cycle_bus
-from gateway.cycle_host import CycleHost
 from gateway.errors import GatewayError
-from gateway.preparation import build_core, prepare
-from gateway.sample import SampleFlag
+from gateway.record.sample import SampleFlag
+from gateway.running import cycle_bus
+from gateway.running.bus_address import BusAddress
+from gateway.running.cycle_bus import open_cycle_bus
+from gateway.running.cycle_host import CycleHost
+from gateway.running.preparation import build_core, prepare
 
 MS = 1_000_000
 CONFIG = load_config("paper")

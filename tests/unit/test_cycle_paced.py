@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from config.schema import GuardSection
 from drivers.nmt import SYNC_COB_ID
-from gateway.cycle import AxisChannel, CyclicLoop
-from gateway.guard import Guard
-from gateway.sample import Phase, SampleFlag
+from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.guard import Guard
+from gateway.record.sample import Phase, SampleFlag
 from gateway.units import AxisUnits
 
 MS = 1_000_000

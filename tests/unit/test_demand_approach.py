@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from gateway.demand import CamDemand
+from gateway.cyclic.demand import CamDemand
 from gateway.units import AxisUnits, wrap_counts
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import plan_run

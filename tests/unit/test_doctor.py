@@ -5,9 +5,9 @@ import json
 import pytest
 from typer.testing import CliRunner
 
-from gateway import doctor
 from gateway.cli.app import app
-from gateway.doctor import Topic, Verdict, Wanted, can_findings, examine, findings_json, host_findings, is_ready
+from gateway.running import doctor
+from gateway.running.doctor import Topic, Verdict, Wanted, can_findings, examine, findings_json, host_findings, is_ready
 
 GOOD_CAN = {
     "ifname": "can0",

@@ -7,7 +7,7 @@ from drive_bench import Bench
 
 from drivers.frame import Frame
 from mechanism.cam_image import CamImage, CamImageFault, decode_cam_image, encode
-from sim_drive.cia402 import PowerState
+from sim_drive.device.cia402 import PowerState
 
 POINTS = 256
 AMPLITUDE = 400.0

@@ -3,7 +3,7 @@
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.cia402 import STATE_BITS, PowerState, PowerStateChanged
+from sim_drive.device.cia402 import STATE_BITS, PowerState, PowerStateChanged
 
 NOT_READY, DISABLED, READY, ON, ENABLED, QUICK, REACTION, FAULT = PowerState
 

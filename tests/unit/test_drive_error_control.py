@@ -4,7 +4,7 @@ import pytest
 from drive_bench import MS, Bench
 
 from drivers.frame import Frame
-from sim_drive.time_of_day import TimeOfDay
+from sim_drive.communication.time_of_day import TimeOfDay
 
 RANGE = 0x06090030
 BOOT_UP = "705#00"

@@ -7,7 +7,7 @@ from drive_bench import MS, Bench
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_drive.scaling import IDENTITY, Scaling, make_scaling
+from sim_drive.device.scaling import IDENTITY, Scaling, make_scaling
 from sim_drive.settings import DriveSettings
 from sim_drive.switches import Switches
 

@@ -8,9 +8,9 @@ from drive_bench import MS, Bench
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from sim_drive import jerk_profiles
-from sim_drive.demand import Demand, Piece
-from sim_drive.profiles import through_position
+from sim_drive.device import jerk_profiles
+from sim_drive.device.demand import Demand, Piece
+from sim_drive.device.profiles import through_position
 
 NS = 1_000_000_000
 positions = st.floats(-1e5, 1e5)

@@ -5,7 +5,7 @@ import struct
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.cia402 import PowerState
+from sim_drive.device.cia402 import PowerState
 from sim_drive.settings import DriveSettings
 from sim_drive.switches import Switches
 

@@ -4,8 +4,8 @@ import pytest
 from drive_bench import MS, Bench, decode_bench_image, described
 
 from drivers.nmt import NmtState
-from sim_drive.drive import UNCONFIGURED_NODE_ID, BitTimingActivated, Drive, NodeIdChanged
-from sim_drive.parameters import MemoryParameterStore, ParameterStoreError, StoredParameters
+from sim_drive.communication.parameters import MemoryParameterStore, ParameterStoreError, StoredParameters
+from sim_drive.device.drive import UNCONFIGURED_NODE_ID, BitTimingActivated, Drive, NodeIdChanged
 from sim_drive.settings import DriveIdentity, DriveSettings
 
 IDENTITY = DriveIdentity(0x000004D2, 0x00001024, 0x00010000, 0xCAFE0007)

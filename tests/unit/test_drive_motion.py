@@ -6,9 +6,9 @@ import zlib
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.axis import wrap_int32
-from sim_drive.cia402 import PowerState
-from sim_drive.demand import Demand
+from sim_drive.device.axis import wrap_int32
+from sim_drive.device.cia402 import PowerState
+from sim_drive.device.demand import Demand
 from sim_drive.settings import DriveSettings
 
 MICRO = 1_000

@@ -5,7 +5,7 @@ from drive_bench import MS, Bench
 
 from drivers.frame import Frame
 from drivers.nmt import NmtState
-from sim_drive.drive import DriveSettings
+from sim_drive.device.drive import DriveSettings
 
 BOOT_UP = "705#00"
 

@@ -3,13 +3,13 @@
 import pytest
 from drive_bench import MS, Bench, decode_bench_image, described
 
-from sim_drive.drive import Drive
-from sim_drive.parameters import (
+from sim_drive.communication.parameters import (
     MemoryParameterStore,
     ParametersLost,
     ParameterStoreError,
     StoredParameters,
 )
+from sim_drive.device.drive import Drive
 from sim_drive.settings import DriveSettings
 
 SAVE, LOAD = "23{index}10{sub:02X}73617665", "23{index}10{sub:02X}6C6F6164"

@@ -3,7 +3,7 @@
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.drive import Drive
+from sim_drive.device.drive import Drive
 from sim_drive.settings import DriveSettings
 
 ORDER = 0x06010000

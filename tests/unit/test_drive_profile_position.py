@@ -3,7 +3,7 @@
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.cia402 import PowerState
+from sim_drive.device.cia402 import PowerState
 
 REACHED, LIMITED, ACKNOWLEDGED = 0x0400, 0x0800, 0x1000
 

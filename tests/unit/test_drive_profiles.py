@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_drive.demand import Demand, Piece
-from sim_drive.profiles import to_position, to_velocity
+from sim_drive.device.demand import Demand, Piece
+from sim_drive.device.profiles import to_position, to_velocity
 
 NS_PER_S = 1_000_000_000
 positions = st.floats(-1e5, 1e5)

@@ -8,10 +8,10 @@ from drive_bench import MS, TICK_NS, Bench, decode_bench_image, described
 from drivers.eds import describe_any_node
 from drivers.frame import Frame
 from sim_drive.assembly import SHIPPED_EDS, settings_of_axes
-from sim_drive.cia402 import PowerState
-from sim_drive.drive import Drive, DriveSettings
+from sim_drive.device.cia402 import PowerState
+from sim_drive.device.drive import Drive, DriveSettings
+from sim_drive.device.quirks import Quirk
 from sim_drive.logical_axes import eds_of_axes, in_first_axis, of_axis
-from sim_drive.quirks import Quirk
 
 DESCRIBE_TWO = describe_any_node(SHIPPED_EDS, lambda text: eds_of_axes(text, 2))
 TWO = DESCRIBE_TWO(5)

@@ -5,8 +5,8 @@ import struct
 import pytest
 from drive_bench import MS, Bench
 
-from sim_drive.cia402 import PowerState
-from sim_drive.servo import VOLT_PER_UNIT, ServoLoop
+from sim_drive.device.cia402 import PowerState
+from sim_drive.physics.servo import VOLT_PER_UNIT, ServoLoop
 from sim_drive.settings import DriveSettings
 
 REACHED, LIMITED, BIT_12 = 0x0400, 0x0800, 0x1000

@@ -8,11 +8,11 @@ from config.emulation_section import DemandRounding
 from config.loading import ConfigError, load_config, parse_config
 from config.schema import SERVO_RATE_HZ, GatewayConfig
 from mechanism.errors import ParameterError
-from sim_drive import servo
 from sim_drive.assembly import build_machine
 from sim_drive.closed_loop import closed_loop_of
-from sim_drive.compliant import CompliantPlant
-from sim_drive.plant import CoupledPlant
+from sim_drive.physics import servo
+from sim_drive.physics.compliant import CompliantPlant
+from sim_drive.physics.plant import CoupledPlant
 
 PAPER = load_config("paper")
 BRAKE = "      brake_torque_Nm: 6.0\n"

@@ -3,9 +3,9 @@
 import pytest
 from fault_line import Line
 
-from sim_drive.drive import Drive
-from sim_drive.faults import FAULTS, Direction, Fault, FaultKind
-from sim_drive.injector import FaultEnded, FaultStarted
+from sim_drive.device.drive import Drive
+from sim_drive.injection.faults import FAULTS, Direction, Fault, FaultKind
+from sim_drive.injection.injector import FaultEnded, FaultStarted
 
 NODE = 5
 TRIPS = [

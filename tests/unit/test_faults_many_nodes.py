@@ -9,9 +9,9 @@ from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
 from sim_drive.assembly import build_machine, free_machine
-from sim_drive.drive import Drive
-from sim_drive.faults import Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.device.drive import Drive
+from sim_drive.injection.faults import Fault, FaultKind
+from sim_drive.injection.injector import Injector
 from sim_drive.settings import DriveSettings
 
 MS = 1_000_000

@@ -5,7 +5,7 @@ from collections import Counter
 import pytest
 from fault_line import MS, Line
 
-from sim_drive.faults import Direction, Fault, FaultKind
+from sim_drive.injection.faults import Direction, Fault, FaultKind
 
 NODE, OTHER = 5, 7
 HEARTBEAT = 0x700 + NODE

@@ -15,11 +15,11 @@ from config.conversion import (
     torque_offset_limit,
 )
 from config.loading import ConfigError, load_config, parse_config
-from gateway.demand import CamDemand
+from gateway.cyclic.demand import CamDemand
+from gateway.cyclic.feed_forward import FeedForward
+from gateway.cyclic.torque_offsets import TorqueOffsets, build_feed_forward, build_torque_offsets, torque_lead_s
 from gateway.errors import GatewayError
-from gateway.feed_forward import FeedForward
-from gateway.preparation import axis_units, compile_config, plan, prepare
-from gateway.torque_offsets import TorqueOffsets, build_feed_forward, build_torque_offsets, torque_lead_s
+from gateway.running.preparation import axis_units, compile_config, plan, prepare
 from gateway.units import AxisUnits
 from mechanism.cam_profile import CamProfile
 from mechanism.dynamics import Dynamics, DynamicsParameters, LinkParameters

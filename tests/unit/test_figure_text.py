@@ -2,7 +2,7 @@
 
 import re
 
-from gateway.figure import new_figure, render_svg
+from gateway.reporting.figure import new_figure, render_svg
 
 
 def draw(theme):

@@ -9,12 +9,12 @@ import pytest
 from config.guard_section import Reaction
 from config.loading import ConfigError, load_config, parse_config
 from drivers.virtual_time import VirtualBus
-from gateway.axis_channel import AxisChannel
-from gateway.guard import REASON_OF, Condition, Guard, StopReason
-from gateway.preparation import build_core, compile_config, guard_limits, prepare, slave_law
-from gateway.sample import Phase
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.guard import REASON_OF, Condition, Guard, StopReason
+from gateway.cyclic.watch import AxisLimits, CycleWatch
+from gateway.record.sample import Phase
+from gateway.running.preparation import build_core, compile_config, guard_limits, prepare, slave_law
 from gateway.units import AxisUnits
-from gateway.watch import AxisLimits, CycleWatch
 from mechanism.deviation import end_effector_miss
 from sim_drive.assembly import build_machine
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.late_watch import LateWatch, ThreadFigures, read_steal_ns, read_thread, read_waited_ns
+from gateway.running.late_watch import LateWatch, ThreadFigures, read_steal_ns, read_thread, read_waited_ns
 
 MS = 1_000_000
 

@@ -9,11 +9,11 @@ import pytest
 
 from config.loading import load_config, parse_config
 from gateway.cli.app import app
+from gateway.cyclic.guard import StopReason
 from gateway.errors import UsageError
-from gateway.guard import StopReason
-from gateway.learning import LearnedTorque
-from gateway.learning_file import LearningMemory, cam_crc32, memory_file, read_memory, write_memory
-from gateway.learning_store import LearningStore, open_store
+from gateway.learning.law import LearnedTorque
+from gateway.learning.memory_file import LearningMemory, cam_crc32, memory_file, read_memory, write_memory
+from gateway.running.learning_store import LearningStore, open_store
 from mechanism.cam_profile import CamProfile
 
 PAPER = load_config("paper")

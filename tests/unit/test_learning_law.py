@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from config.conversion import nominal_parameters
 from config.loading import load_config
-from gateway import learning_kernels as kernels
-from gateway.learning import LearnedTorque, Learning, LearningSettings, masses_along
-from gateway.preparation import compile_config
-from gateway.torque_offsets import TorqueOffsets
+from gateway.cyclic.torque_offsets import TorqueOffsets
+from gateway.learning import kernels as kernels
+from gateway.learning.law import LearnedTorque, Learning, LearningSettings, masses_along
+from gateway.running.preparation import compile_config
 from gateway.units import AxisUnits
 from mechanism.dynamics import mass_matrix_and_bias
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from config.conversion import five_bar
 from config.loading import load_config
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from mechanism.approach import ApproachField
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import ApproachError

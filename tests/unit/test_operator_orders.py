@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recording_samples import CONSTANTS
 
-from gateway.control import send_order
-from gateway.cyclic_process import pass_on_order
+from gateway.cyclic.operation import Order
 from gateway.errors import GatewayError
-from gateway.operation import Order
-from gateway.order_word import pack_order, unpack_order
-from gateway.ring import RingReader, RingWriter, RunState
+from gateway.record.order_word import pack_order, unpack_order
+from gateway.record.ring import RingReader, RingWriter, RunState
+from gateway.running.control import send_order
+from gateway.running.cyclic_process import pass_on_order
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -62,7 +62,7 @@ def test_an_order_is_answered_by_its_event(monkeypatch):
             ring.append_event(1, "order", "override 50 taken", order="override", value=50.0, refusal="")
 
         # The loop answers while the other side waits.
-        monkeypatch.setattr("gateway.control.time.sleep", answer)
+        monkeypatch.setattr("gateway.running.control.time.sleep", answer)
         assert send_order("answered-orders", Order.OVERRIDE, 50.0)["refusal"] == ""
         with pytest.raises(GatewayError, match="is not within"):
             send_order("answered-orders", Order.OVERRIDE, 1e12)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from gateway.paper_comparison import FirstCycle, TorqueDemand, TunedRun, compare, to_markdown
-from gateway.paper_figures import ServoTicks, reproduce
+from gateway.reporting.paper_comparison import FirstCycle, TorqueDemand, TunedRun, compare, to_markdown
+from gateway.reporting.paper_figures import ServoTicks, reproduce
 from mechanism.five_bar import Closure, FiveBar
 
 FIVE_BAR = FiveBar(0.15, 0.25, 0.3, 0.15, (0.0, 0.0), (0.25, 0.0))

@@ -11,9 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.frame import Frame
-from sim_drive.drive import Drive
-from sim_drive.parameter_file import FileParameterStore, make_parameter_store
-from sim_drive.parameters import MemoryParameterStore, ParametersLost, ParameterStoreError, StoredParameters
+from sim_drive.communication.parameter_file import FileParameterStore, make_parameter_store
+from sim_drive.communication.parameters import (
+    MemoryParameterStore,
+    ParametersLost,
+    ParameterStoreError,
+    StoredParameters,
+)
+from sim_drive.device.drive import Drive
 from sim_drive.settings import DriveSettings
 
 SOME = StoredParameters({(0x1017, 0): b"\x64\0", (0x3020, 1): b"\xff\xff\xff\xff"}, node_id=7, bit_timing=2)

@@ -8,11 +8,11 @@ import pytest
 from driven_machine import OFF, PERIODS_IN_CYCLE, compiled, drive_on_the_cam, frictionless, paper_dynamics
 
 from mechanism.dynamics import DynamicsParameters, inverse_dynamics, mass_matrix_and_bias
-from sim_drive.compliant import CompliantPlant
-from sim_drive.coupling import Coupling, coupling_torques
-from sim_drive.driveline import SERVO_PERIOD_S
-from sim_drive.five_bar_motion import METERED_SIZE
-from sim_drive.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.physics.compliant import CompliantPlant
+from sim_drive.physics.coupling import Coupling, coupling_torques
+from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.physics.five_bar_motion import METERED_SIZE
+from sim_drive.physics.plant import AxisDriveline, CoupledPlant, PlantParameters
 
 ON = (True, True)
 

@@ -8,8 +8,8 @@ import pytest
 from driven_machine import PERIODS_IN_CYCLE, compiled, drive_on_the_cam, frictionless, paper_dynamics
 
 from mechanism.dynamics import DynamicsParameters
-from sim_drive.driveline import MotorParameters
-from sim_drive.plant import (
+from sim_drive.physics.driveline import MotorParameters
+from sim_drive.physics.plant import (
     SERVO_PERIOD_S,
     AxisDriveline,
     CoupledPlant,

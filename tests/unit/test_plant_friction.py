@@ -3,7 +3,7 @@
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from sim_drive.friction import STOP_IMPULSE, impulse_bounds, velocities_after_impulse, velocity_after_impulse
+from sim_drive.physics.friction import STOP_IMPULSE, impulse_bounds, velocities_after_impulse, velocity_after_impulse
 
 
 def test_single_axis_slides_on_with_what_friction_leaves() -> None:

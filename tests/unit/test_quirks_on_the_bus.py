@@ -7,7 +7,7 @@ from fault_line import Line
 
 from config.quirks import Quirk
 from sim_drive.assembly import FREE_AXIS_GAINS
-from sim_drive.quirks import describe_quirks
+from sim_drive.device.quirks import describe_quirks
 from sim_drive.settings import DriveSettings
 
 NODE = 5

@@ -20,8 +20,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from recording_samples import CONSTANTS, LAYOUT, steady_run
 
-from gateway.mcap_file import McapError, RawChunk, scan, split_records
-from gateway.recording import (
+from gateway.record.mcap_file import McapError, RawChunk, scan, split_records
+from gateway.record.recording import (
     RecordingError,
     RecordingMetadata,
     RecordingSink,
@@ -29,8 +29,8 @@ from gateway.recording import (
     read_recording,
     write_candump_log,
 )
-from gateway.ring import FRAME_DTYPE, FrameArray, RingWriter, RunEvent, RunState
-from gateway.sample import SampleArray
+from gateway.record.ring import FRAME_DTYPE, FrameArray, RingWriter, RunEvent, RunState
+from gateway.record.sample import SampleArray
 
 METADATA = RecordingMetadata(CONSTANTS, "name: hand-made\n", product_version="1.2.3")
 
@@ -294,7 +294,7 @@ def _ring_with_a_run(folder: Path) -> RingWriter:
 
 def _recorder(ring: Path, out: Path) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "gateway.recorder", str(ring), str(out)],
+        [sys.executable, "-m", "gateway.running.recorder", str(ring), str(out)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

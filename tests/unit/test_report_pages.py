@@ -14,16 +14,16 @@ import pytest
 from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 from rich.console import Console
 
-from gateway.analysis import analyse, prepare, report_of
 from gateway.errors import GatewayError
-from gateway.monitor import Monitor, last_cycle, monitor, render_view, sparkline
-from gateway.plots import overlay, plots_of, to_png, to_svg
-from gateway.recording import RecordingError, RecordingMetadata, RecordingWriter, read_recording
-from gateway.report import write_report
-from gateway.report_text import render_report
-from gateway.ring import RingReader, RingWriter, RunEvent, RunState
-from gateway.run_constants import RunConstants
-from gateway.sample import Phase, SampleArray, missed_tpdo_flag
+from gateway.record.recording import RecordingError, RecordingMetadata, RecordingWriter, read_recording
+from gateway.record.ring import RingReader, RingWriter, RunEvent, RunState
+from gateway.record.run_constants import RunConstants
+from gateway.record.sample import Phase, SampleArray, missed_tpdo_flag
+from gateway.reporting.analysis import analyse, prepare, report_of
+from gateway.reporting.monitor import Monitor, last_cycle, monitor, render_view, sparkline
+from gateway.reporting.plots import overlay, plots_of, to_png, to_svg
+from gateway.reporting.report import write_report
+from gateway.reporting.report_text import render_report
 
 
 def record(path: Path, samples: SampleArray, constants: RunConstants = CONSTANTS) -> Path:
@@ -102,7 +102,7 @@ def test_figures_of_the_page_take_their_colours_from_it() -> None:
 
 @pytest.mark.parametrize("kind", ["one record", "never moved", "all missed", "many cycles", "no mechanism", "stopped"])
 def test_poor_runs_have_a_report_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
-    monkeypatch.setattr("gateway.report.to_png", lambda _plot, _data: b"")  # drawn as SVG by the same code
+    monkeypatch.setattr("gateway.reporting.report.to_png", lambda _plot, _data: b"")  # drawn as SVG by the same code
     samples = steady_run(600, records_a_turn=20 if kind == "many cycles" else 1000)
     constants = CONSTANTS
     if kind == "one record":

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from recording_samples import CONSTANTS, LAYOUT
 
-from gateway.ring import (
+from gateway.record.ring import (
     EVENT_MAX_BYTES,
     FRAME_DTYPE,
     RingError,
@@ -23,8 +23,8 @@ from gateway.ring import (
     StopRequest,
     find_rings,
 )
-from gateway.run_constants import RunConstants
-from gateway.sample import SampleLayout, saturate_int32
+from gateway.record.run_constants import RunConstants
+from gateway.record.sample import SampleLayout, saturate_int32
 
 VALUES = (7, 1_000_000, 0.5, 6.25, 6.25, -3.5, 1, 2, 3, 4, 5, 6, 3, 1, 10, 20, 11, 19, 0x1237, 0x0008, -5, 6, 7, -8)
 
@@ -245,7 +245,7 @@ def test_capacities_are_powers_of_two(tmp_path: Path) -> None:
 CHILD = """
 import sys
 from pathlib import Path
-from gateway.ring import RingWriter
+from gateway.record.ring import RingWriter
 ring = RingWriter.take_over(Path(sys.argv[1]))
 ring.append(*range(1, 5), 0.0, 0.0, *range(7, 25))
 print("ready", flush=True)

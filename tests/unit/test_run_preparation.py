@@ -7,7 +7,7 @@ import yaml
 
 from config.loading import load_config, parse_config
 from gateway.errors import GatewayError
-from gateway.preparation import plan, prepare
+from gateway.running.preparation import plan, prepare
 
 PAPER = load_config("paper")
 

@@ -12,7 +12,7 @@ from config.quirks import Quirk
 from drivers.frame import Frame
 from drivers.ports import open_port
 from sim_drive.cli import parse_node_ids
-from sim_drive.faults import FaultKind
+from sim_drive.injection.faults import FaultKind
 
 COMMAND = [sys.executable, "-m", "sim_drive"]
 PATIENCE_S = 60.0

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from config.loading import ConfigError
-from sim_drive.faults import Direction, Fault, FaultKind
-from sim_drive.scenario import Scenario, load_scenario, parse_fault, parse_scenario
+from sim_drive.injection.faults import Direction, Fault, FaultKind
+from sim_drive.injection.scenario import Scenario, load_scenario, parse_fault, parse_scenario
 
 NODES = {"cv": 1, "servo": 2}
 IDS = (1, 2)

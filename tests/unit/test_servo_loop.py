@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sim_drive.servo import OUTPUT_MAXIMUM, OUTPUT_MINIMUM, VOLT_PER_UNIT, DemandResolution, ServoLoop
+from sim_drive.physics.servo import OUTPUT_MAXIMUM, OUTPUT_MINIMUM, VOLT_PER_UNIT, DemandResolution, ServoLoop
 
 NM_PER_VOLT = 0.45
 NM_PER_UNIT = VOLT_PER_UNIT * NM_PER_VOLT

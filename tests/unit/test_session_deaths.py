@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gateway.ring import RingReader, RunState, find_rings, runtime_directory
-from gateway.sample import Phase
+from gateway.record.ring import RingReader, RunState, find_rings, runtime_directory
+from gateway.record.sample import Phase
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
@@ -95,7 +95,7 @@ def test_a_killed_recorder_and_a_killed_monitor_do_not_touch_the_cycle(machine, 
     monitor = start("monitor", machine[1], "--json", folder=tmp_path)
     time.sleep(0.5)
     monitor.kill()
-    os.kill(child_of(process, "gateway.recorder"), signal.SIGKILL)
+    os.kill(child_of(process, "gateway.running.recorder"), signal.SIGKILL)
     monitor.wait()
     while process.poll() is None:
         seen.append(reader.read_new()[0]["phase"])

@@ -12,12 +12,12 @@ import pytest
 
 from config.loading import load_config
 from drivers.frame import Frame
-from gateway.bus_address import resolve_bus
-from gateway.cycle_host import run_core
-from gateway.cyclic_process import pass_on_stop, refuse_other_master
 from gateway.errors import GatewayError
-from gateway.ring import StopRequest
-from gateway.session import StopSwitch
+from gateway.record.ring import StopRequest
+from gateway.running.bus_address import resolve_bus
+from gateway.running.cycle_host import run_core
+from gateway.running.cyclic_process import pass_on_stop, refuse_other_master
+from gateway.running.session import StopSwitch
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 
@@ -151,7 +151,7 @@ def test_python_can_is_told_the_bit_rate(monkeypatch):
 
 def test_a_child_ends_with_a_parent_that_is_killed(tmp_path):
     (tmp_path / "blocker.py").write_text("import signal\nprint('up', flush=True)\nsignal.pause()\n")
-    start = "import os, subprocess, sys; subprocess.Popen([sys.executable, '-m', 'gateway.child_process', "
+    start = "import os, subprocess, sys; subprocess.Popen([sys.executable, '-m', 'gateway.running.child_process', "
     start += "str(os.getpid()), 'blocker']).wait()"
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
     parent = subprocess.Popen([sys.executable, "-c", start], stdout=subprocess.PIPE, env=environment)

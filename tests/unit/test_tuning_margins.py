@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from config.loading import load_config, parse_config
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from gateway.tuning import controller
 from gateway.tuning.margins import (
     Margin,
@@ -24,8 +24,8 @@ from gateway.tuning.margins import (
     spectral_radius,
 )
 from gateway.tuning.response import FINE_COUNTS, frictionless_text, measure_loop
-from sim_drive import servo
 from sim_drive.closed_loop import closed_loop_of
+from sim_drive.physics import servo
 
 PAPER = load_config("paper")
 GAINS = np.array([[8000, 0, 0, 120_000, 120_000], [4000, 40, 500, 45_000, 45_000]], dtype=float)

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from config.loading import load_config
 from gateway.cli.app import app
-from gateway.preparation import compile_config
+from gateway.running.preparation import compile_config
 from gateway.tuning.controller import Gains
 from gateway.tuning.margins import gain_array, loop_model
 from gateway.tuning.search import GainSearch, TuningGoals, search_gains, state_tuning

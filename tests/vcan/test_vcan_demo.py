@@ -9,7 +9,7 @@ import can
 import pytest
 
 from drivers.ports import interface_is_up
-from gateway.recording import read_recording
+from gateway.record.recording import read_recording
 
 pytestmark = [
     pytest.mark.vcan,

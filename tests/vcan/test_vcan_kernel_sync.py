@@ -17,7 +17,7 @@ from drivers.broadcast_manager import PeriodicFrame
 from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.ports import interface_is_up, open_port
-from gateway.recording import read_recording
+from gateway.record.recording import read_recording
 
 pytestmark = [
     pytest.mark.vcan,

@@ -13,7 +13,7 @@ import canopen
 import pytest
 
 from drivers.ports import interface_is_up
-from gateway.recording import read_recording
+from gateway.record.recording import read_recording
 
 pytestmark = [
     pytest.mark.vcan,
@@ -121,7 +121,7 @@ def test_a_killed_cyclic_process_is_a_fault_of_every_drive(
 ) -> None:
     process = start_run(drive_gateway, unhurried, tmp_path)
     wait_for_motion(bus, process)
-    os.kill(child_of(process, "gateway.cyclic_process"), signal.SIGKILL)
+    os.kill(child_of(process, "gateway.running.cyclic_process"), signal.SIGKILL)
 
     # Heartbeat lost, fault reaction, fault: with nobody left to tell them.
     assert [wait_until_disabled(node) for node in drives] == [0x08, 0x08]
@@ -144,8 +144,8 @@ def test_a_cyclic_process_that_has_lost_its_parent_stops_the_machine_on_the_cam(
 ) -> None:
     process = start_run(drive_gateway, unhurried, tmp_path)
     wait_for_motion(bus, process)
-    recorder = os.pidfd_open(child_of(process, "gateway.recorder"))
-    cyclic = os.pidfd_open(child_of(process, "gateway.cyclic_process"))
+    recorder = os.pidfd_open(child_of(process, "gateway.running.recorder"))
+    cyclic = os.pidfd_open(child_of(process, "gateway.running.cyclic_process"))
     process.kill()
     process.communicate(timeout=PATIENCE_S)
     # Until it has ended, the SDO channels of the drives are its own.

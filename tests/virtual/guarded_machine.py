@@ -13,14 +13,14 @@ from config.schema import GatewayConfig
 from drivers.frame import Frame
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
-from gateway.core import GatewayCore
-from gateway.guard import GuardTripped, StopReason
-from gateway.preparation import PreparedRun, build_core, prepare
-from gateway.sample import Phase
+from gateway.cyclic.guard import GuardTripped, StopReason
+from gateway.record.sample import Phase
+from gateway.running.core import GatewayCore
+from gateway.running.preparation import PreparedRun, build_core, prepare
 from mechanism.dynamics import inverse_dynamics_along
 from sim_drive.assembly import build_machine
-from sim_drive.faults import Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.injection.faults import Fault, FaultKind
+from sim_drive.injection.injector import Injector
 
 SECOND = 1_000_000_000
 CV, SERVO = 1, 2

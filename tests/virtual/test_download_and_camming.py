@@ -10,17 +10,17 @@ from config.loading import load_config
 from drivers.object_dictionary import DataType
 from drivers.pdo import MappingEntry
 from drivers.virtual_time import VirtualBus
-from gateway.commissioning import map_pdo
-from gateway.core import GatewayCore
-from gateway.cycle import AxisChannel, CyclicLoop
-from gateway.demand import CamDemand
-from gateway.download import download_image
+from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.demand import CamDemand
+from gateway.cyclic.guard import Guard, StopReason
 from gateway.errors import GatewayError
-from gateway.guard import Guard, StopReason
-from gateway.powering import AxisPower, AxisSetup
-from gateway.preparation import axis_units, build_master, network_settings, node_settings, prepare
-from gateway.procedure_core import ProcedureCore
-from gateway.sample import Phase, SampleLayout
+from gateway.record.sample import Phase, SampleLayout
+from gateway.running.commissioning import map_pdo
+from gateway.running.core import GatewayCore
+from gateway.running.download import download_image
+from gateway.running.powering import AxisPower, AxisSetup
+from gateway.running.preparation import axis_units, build_master, network_settings, node_settings, prepare
+from gateway.running.procedure_core import ProcedureCore
 from mechanism.cam_image import encode_cam_image
 from sim_drive.assembly import build_machine
 

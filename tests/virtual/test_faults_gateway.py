@@ -7,11 +7,11 @@ from config.quirks import Quirk
 from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
-from gateway.guard import StopReason
-from gateway.preparation import build_core, prepare
+from gateway.cyclic.guard import StopReason
+from gateway.running.preparation import build_core, prepare
 from sim_drive.assembly import build_machine
-from sim_drive.faults import Direction, Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.injection.faults import Direction, Fault, FaultKind
+from sim_drive.injection.injector import Injector
 
 PAPER = load_config("paper")
 PREPARED = prepare(PAPER, 1)

@@ -5,8 +5,8 @@ import pytest
 from torque_study import PAPER, FastRun, WholeRun, configured
 
 from config.conversion import torque_delay_s
-from gateway.preparation import compile_config
-from gateway.sample import Phase
+from gateway.record.sample import Phase
+from gateway.running.preparation import compile_config
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ import pytest
 from config.loading import load_config, parse_config
 from drivers.cia402 import State, state_of
 from drivers.virtual_time import VirtualBus
-from gateway.analysis import analyse
-from gateway.guard import GuardTripped, StopReason
-from gateway.preparation import build_core, prepare
-from gateway.recording import read_recording
-from gateway.sample import Phase, SampleLayout
-from gateway.virtual_run import run_virtual
+from gateway.cyclic.guard import GuardTripped, StopReason
+from gateway.record.recording import read_recording
+from gateway.record.sample import Phase, SampleLayout
+from gateway.reporting.analysis import analyse
+from gateway.running.preparation import build_core, prepare
+from gateway.running.virtual_run import run_virtual
 from sim_drive.assembly import build_machine
 
 PAPER = load_config("paper")

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import pytest
 from guarded_machine import CV, PAPER, SERVO, Guarded, Host, changed
 
-from gateway.guard import Condition, StopReason
-from gateway.sample import Phase
-from sim_drive.faults import Direction, Fault, FaultKind
+from gateway.cyclic.guard import Condition, StopReason
+from gateway.record.sample import Phase
+from sim_drive.injection.faults import Direction, Fault, FaultKind
 
 CONTROLLED_BOUND_RAD = math.radians(6.0)
 """How far link s may get from the cam in a controlled stop; in an undisturbed run it is 5.3 deg (60 counts)."""

@@ -5,9 +5,9 @@ import math
 import pytest
 from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2, changed
 
-from gateway.guard import StopReason
-from gateway.sample import Phase
-from sim_drive.faults import Fault, FaultKind
+from gateway.cyclic.guard import StopReason
+from gateway.record.sample import Phase
+from sim_drive.injection.faults import Fault, FaultKind
 
 BOUND_RAD = math.radians(20.0)
 """How far from the cam the servo axis may get if the lost axis has a brake."""

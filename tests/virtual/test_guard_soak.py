@@ -14,12 +14,12 @@ import pytest
 from guarded_machine import CV, PAPER, SECOND, SERVO, changed, prepared_run
 
 from drivers.virtual_time import VirtualBus
-from gateway.guard import GuardTripped, StopReason
-from gateway.preparation import build_core
-from gateway.recovery import AxisRecovered
+from gateway.cyclic.guard import GuardTripped, StopReason
+from gateway.running.preparation import build_core
+from gateway.running.recovery import AxisRecovered
 from sim_drive.assembly import build_machine
-from sim_drive.faults import Direction, Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.injection.faults import Direction, Fault, FaultKind
+from sim_drive.injection.injector import Injector
 
 HOURS = float(os.environ.get("DRIVE_GATEWAY_SOAK_HOURS", "0.08"))
 LASTING = (FaultKind.FROZEN_RESOLVER,)

@@ -16,12 +16,12 @@ from torque_study import (
     wrong_model,
 )
 
-from gateway.analysis import analyse
 from gateway.cli.app import app
-from gateway.learning_file import cam_crc32
-from gateway.preparation import compile_config
-from gateway.recording import read_recording
-from gateway.sample import Phase
+from gateway.learning.memory_file import cam_crc32
+from gateway.record.recording import read_recording
+from gateway.record.sample import Phase
+from gateway.reporting.analysis import analyse
+from gateway.running.preparation import compile_config
 
 SERVO_PEAK, SERVO_RMS, CV_PEAK = 2, 0.6, 1
 """What learning has to reach within ten machine cycles."""

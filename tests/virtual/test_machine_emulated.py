@@ -19,7 +19,7 @@ from sim_drive.machine import (
     TickRecord,
     TimeSkipped,
 )
-from sim_drive.plant import (
+from sim_drive.physics.plant import (
     AxisDriveline,
     CoupledPlant,
     FreeAxisParameters,

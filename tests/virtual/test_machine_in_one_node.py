@@ -5,8 +5,8 @@ import struct
 from config.loading import load_config
 from drivers.frame import Frame
 from sim_drive.assembly import build_machine
-from sim_drive.faults import Fault, FaultKind
-from sim_drive.injector import Injector
+from sim_drive.injection.faults import Fault, FaultKind
+from sim_drive.injection.injector import Injector
 from sim_drive.machine import EmulatedMachine
 
 CONFIG = load_config("paper")

@@ -7,9 +7,9 @@ from config.gain_sets import GainSet, with_gain_set
 from config.loading import load_config, parse_config
 from config.schema import GatewayConfig
 from drivers.virtual_time import VirtualBus
-from gateway.core import GatewayCore
-from gateway.guard import StopReason
-from gateway.preparation import build_core, prepare
+from gateway.cyclic.guard import StopReason
+from gateway.running.core import GatewayCore
+from gateway.running.preparation import build_core, prepare
 from sim_drive.assembly import build_machine
 from sim_drive.machine import EmulatedMachine
 

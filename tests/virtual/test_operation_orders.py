@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from guarded_machine import PAPER, Guarded, at_theta2
 
-from gateway.guard import StopReason
-from gateway.operation import Order, OrderAnswered
-from gateway.sample import Phase, SampleLayout
+from gateway.cyclic.guard import StopReason
+from gateway.cyclic.operation import Order, OrderAnswered
+from gateway.record.sample import Phase, SampleLayout
 
 LAYOUT = SampleLayout(PAPER.axis_names)
 

@@ -7,9 +7,9 @@ from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
 from test_approach_from_anywhere import Again
 
 from drivers.cia402 import State, state_of
-from gateway.recovery import AxisRecovered
-from gateway.sample import Phase
-from sim_drive.faults import Fault, FaultKind
+from gateway.record.sample import Phase
+from gateway.running.recovery import AxisRecovered
+from sim_drive.injection.faults import Fault, FaultKind
 
 AT_S = at_theta2(100)
 LOST_REFERENCE = "its reference is lost: bring the linkage to its home position"

@@ -7,7 +7,7 @@ import pytest
 from config.loading import load_config, parse_config
 from drivers import objects
 from gateway.errors import GatewayError
-from gateway.preparation import prepare
+from gateway.running.preparation import prepare
 from gateway.tuning.controller import Gains
 from gateway.tuning.on_machine import VirtualTimeMachine, gain_path, trial_config, tune_on_machine
 from sim_drive.assembly import build_machine

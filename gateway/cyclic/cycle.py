@@ -1,0 +1,538 @@
+"""The cycle: SYNC, actual values, guard, demand, RPDOs, in one fixed order; a core without I/O.
+
+    SYNC(k) -> drives latch actual values, apply the demand received before SYNC(k), send TPDOs(k)
+            -> the loop has all TPDOs(k), or their deadline passes -> guard -> demand -> RPDOs -> SYNC(k+1)
+
+A drive in cyclic synchronous position reaches the target that it applied at SYNC(k-1) at SYNC(k), where it also latches
+its actual position. So the following error of cycle k compares the target that was *sent* in cycle k-2 with the actual
+value latched at SYNC(k): both belong to the same instant.
+"""
+
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import Final, Protocol
+
+from config.guard_section import Reaction
+from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
+from drivers.frame import Frame
+from drivers.nmt import SYNC_COB_ID
+from drivers.object_dictionary import DataType
+from drivers.pdo import PdoLayout
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.demand import Demand
+from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.reactions import CoupledStop
+from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
+from gateway.record.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
+from gateway.units import HALF_RANGE, RANGE_MASK
+
+__all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop", "SampleSink"]
+
+RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
+"""Controlword, target position, torque offset."""
+TPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
+"""Statusword, position actual value, torque actual value."""
+
+SYNC_FRAME: Final = Frame(SYNC_COB_ID)
+TPDO_DEADLINE: Final = 0.8
+"""Share of the cycle after which a TPDO counts as missed and the demand is sent without it."""
+SYNC_PATIENCE: Final = 2
+"""A SYNC that is late by this part of the period counts as missing."""
+SYNC_TAKE_OVER: Final = 3
+"""After so many missing SYNCs in a row the loop sends them itself."""
+GRID_FILTER: Final = 2
+"""The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC,
+and its grid slips by what each of them is late."""
+
+
+# Looked up once: the cycle needs them a thousand times a second and more.
+_actual_of: Final = attrgetter("actual")
+_statusword_of: Final = attrgetter("statusword")
+_torque_of: Final = attrgetter("torque")
+_target_of: Final = attrgetter("target")
+_unpack_tpdo: Final = TPDO_LAYOUT.unpack_from
+_pack_rpdo: Final = RPDO_LAYOUT.pack
+_TPDO_LENGTH: Final = TPDO_LAYOUT.length
+_COMMISSIONING: Final = Phase.COMMISSIONING
+_CAM: Final = Phase.CAM
+
+
+class SampleSink(Protocol):
+    """Where the cycle's samples go: the shared-memory ring, or a list in virtual time."""
+
+    def append(self, *values: float) -> None:
+        """Take one sample, the values in the order of ``SampleLayout.pack_into``."""
+        ...
+
+
+class ErrorObserver(Protocol):
+    """Who is shown the following errors in motion, before the next demand is taken; not those of a missed TPDO."""
+
+    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
+        """Errors in counts, one an axis, and the master's demand (rad, rad/s) for the instant at which they were.
+
+        ``is_steady``: the machine is at speed on the cam, and nothing that is guarded is amiss.
+        """
+        ...
+
+
+_Sent = tuple[float, float, list[float], list[int], list[int], Phase]
+"""A demand: master position, master velocity, velocities, targets, torque offsets, phase. Its lists are not changed."""
+
+
+class CyclicLoop:
+    """The cyclic exchange with all axes.
+
+    Until ``follow`` is called the target of a drive without torque is its actual position, and it is held from the
+    moment the drive is enabled, so that the axis stays where it is. The host calls ``sent`` after it has handed a batch
+    of frames to the bus.
+    """
+
+    __slots__ = (
+        "_all_axes",
+        "_applied",
+        "_arrival_ns",
+        "_awaited",
+        "_coupled_stop",
+        "_cpu_clock",
+        "_cpu_last_ns",
+        "_cpu_ns",
+        "_deadline_share_ns",
+        "_demand",
+        "_doubtful",
+        "_flags",
+        "_in_force",
+        "_is_closed",
+        "_is_coupled_stop_due",
+        "_is_taken",
+        "_no_torque_offsets",
+        "_no_velocities",
+        "_observer",
+        "_provisional",
+        "_sent",
+        "_sent_ns",
+        "_sink",
+        "_sync_deviation_ns",
+        "_sync_due_ns",
+        "_sync_ns",
+        "_sync_period_ns",
+        "_wake_lateness_ns",
+        "_watch",
+        "actuals_are_valid",
+        "axes",
+        "cycle",
+        "guard",
+        "is_guarding_enabled",
+        "is_paced",
+        "is_running",
+        "missing_syncs",
+        "outbox",
+        "period_ns",
+        "phase",
+        "sync_gap_limit",
+        "tpdo_slots",
+    )
+
+    def __init__(
+        self,
+        axes: list[AxisChannel],
+        period_ns: int,
+        guard: Guard,
+        sink: SampleSink,
+        cpu_clock: Callable[[], int] | None = None,
+        tpdo_deadline_ns: int | None = None,
+        watch: CycleWatch | None = None,
+        coupled_stop: CoupledStop | None = None,
+    ) -> None:
+        """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0.
+
+        ``tpdo_deadline_ns``: how long after SYNC the TPDOs are waited for; None is ``TPDO_DEADLINE`` of the period.
+        ``watch`` is what every cycle is compared with, ``coupled_stop`` how a machine whose axes depend on each other
+        makes a quick stop; without the latter every drive makes its own.
+        """
+        self.axes = axes
+        self.period_ns = period_ns
+        self.guard = guard
+        self.outbox: list[Frame] = []
+        self.cycle = -1
+        self.is_running = False
+        self.is_paced = False
+        """SYNC is sent by somebody else, the kernel, and seen by ``receive_sync``; set before ``start``."""
+        self.missing_syncs = 0
+        """SYNCs in a row that were due and not seen."""
+        self.actuals_are_valid = False
+        """Every axis has sent a TPDO for the cycle that was closed last."""
+        self.phase = Phase.COMMISSIONING
+        self.is_guarding_enabled = False
+        """Set while all drives are meant to be in Operation enabled."""
+        self.sync_gap_limit = INT32_MAX
+        """So many SYNCs in a row that were not sent are a condition of the guard's; so is a timer that sends none."""
+        self.tpdo_slots = {axis.tpdo_cob_id: number for number, axis in enumerate(axes)}
+        self._watch = watch or CycleWatch(guard, axes)
+        self._coupled_stop = coupled_stop
+        self._is_coupled_stop_due = False
+        self._sink = sink
+        self._cpu_clock = cpu_clock
+        self._cpu_ns = 0
+        self._cpu_last_ns = 0
+        self._demand: Demand | None = None
+        self._observer: ErrorObserver | None = None
+        self._all_axes = (1 << len(axes)) - 1
+        deadline_ns = round(period_ns * TPDO_DEADLINE) if tpdo_deadline_ns is None else tpdo_deadline_ns
+        self._deadline_share_ns = period_ns - deadline_ns
+        self._sync_due_ns = 0
+        self._sync_ns = 0
+        self._sync_deviation_ns = 0
+        self._sync_period_ns = 0
+        self._wake_lateness_ns = 0
+        self._awaited = 0
+        self._doubtful = 0
+        """Axes whose TPDO was missed in the cycle before: the next one may be that one, come late."""
+        self._provisional = 0
+        """Doubtful axes of which one TPDO has come in this cycle."""
+        self._is_closed = True
+        self._is_taken = True
+        """The demand sent last was on the bus before the SYNC that came last, so that the drives apply it."""
+        self._arrival_ns = 0
+        self._sent_ns = 0
+        self._flags = 0
+        self._no_velocities = [0.0] * len(axes)
+        self._no_torque_offsets = [0] * len(axes)
+        nothing = (0.0, 0.0, self._no_velocities, [0] * len(axes), self._no_torque_offsets, _COMMISSIONING)
+        self._in_force: _Sent = nothing
+        self._applied: _Sent = nothing
+        self._sent: _Sent = nothing
+        """Demands by age: reached at the last SYNC, applied at the last SYNC, sent last."""
+
+    # -- commands ------------------------------------------------------------------------------------------------
+
+    def start(self, now_ns: int) -> None:
+        """Begin the cycle: the first SYNC goes out one period from now."""
+        self.is_running = True
+        self._sync_due_ns = now_ns + self.period_ns
+        self._sync_ns = now_ns
+        self._is_closed = True
+        self._is_taken = True
+        self.missing_syncs = 0
+
+    def stop(self) -> None:
+        """No further SYNC."""
+        self.is_running = False
+
+    def follow(self, demand: Demand | None, observer: ErrorObserver | None = None) -> None:
+        """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions.
+
+        ``observer`` is shown the following errors as long as the demand is followed.
+        """
+        self._demand = demand
+        self._observer = observer
+
+    def command(self, controlword: int) -> None:
+        """Send this controlword to every axis from the next RPDO on."""
+        for axis in self.axes:
+            axis.controlword = controlword
+
+    def controlled_stop(self) -> None:
+        """Ramp the master down on the cam, if anything is in motion."""
+        if self._demand is not None:
+            self._demand.controlled_stop()
+
+    def quick_stop(self) -> None:
+        """Stop as fast as the drives can, and take the torque from the axes that the guard has disabled.
+
+        The demand is left behind; a machine in motion whose axes depend on each other makes a coupled stop. Does
+        nothing to drives that are being disabled.
+        """
+        if self.phase is Phase.DISABLED:
+            return
+        if self.phase is not Phase.QUICK_STOP:
+            self.is_guarding_enabled = False
+            is_on_cam = self._demand is not None and Phase.RAMP_UP <= self.phase <= Phase.CONTROLLED_STOP
+            is_coupled = is_on_cam and self._coupled_stop is not None
+            # It begins with the actual values of the cycle that is closed next.
+            self._is_coupled_stop_due = is_coupled
+            self.follow(None)
+            self.phase = Phase.QUICK_STOP
+            if not is_coupled:
+                self.command(COMMAND_QUICK_STOP)
+        disabled = self.guard.disabled
+        if disabled:
+            for number, axis in enumerate(self.axes):
+                if disabled >> number & 1:
+                    axis.controlword = COMMAND_DISABLE_VOLTAGE
+
+    # -- the cycle -----------------------------------------------------------------------------------------------
+
+    def next_wake_ns(self) -> int:
+        """The TPDOs' deadline while they are awaited, else the next SYNC, or when it counts as missing."""
+        if not self._is_closed:
+            return self._sync_due_ns - self._deadline_share_ns
+        return self._sync_due_ns + self.period_ns // SYNC_PATIENCE if self.is_paced else self._sync_due_ns
+
+    @property
+    def sync_due_ns(self) -> int:
+        """When the next SYNC is due."""
+        return self._sync_due_ns
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the demand of this cycle has been sent, and only the next SYNC is waited for."""
+        return self._is_closed
+
+    @property
+    def arrival_offset_ns(self) -> int:
+        """How long after its SYNC the last TPDO of this cycle came; 0 as long as none is there."""
+        return self._arrival_ns - self._sync_ns
+
+    def wake(self, now_ns: int) -> bool:
+        """Do what is due; returns whether a cycle was closed."""
+        closed = False
+        if not self._is_closed and now_ns >= self._sync_due_ns - self._deadline_share_ns:
+            self._close(now_ns)
+            closed = True
+        if self.is_paced:
+            if now_ns >= self._sync_due_ns + self.period_ns // SYNC_PATIENCE:
+                self._miss_sync(now_ns)
+        elif now_ns >= self._sync_due_ns:
+            self._send_sync(now_ns)
+        return closed
+
+    def receive_sync(self, at_ns: int) -> bool:
+        """The SYNC that paces this loop was on the bus at ``at_ns``; returns whether a cycle was closed."""
+        if not self.is_paced:
+            return False
+        was_open = not self._is_closed
+        if was_open:
+            # The loop has slept through its deadline: what it sends now comes too late for this SYNC.
+            self._close(at_ns)
+            self._sent_ns = at_ns + 1
+        if self.cycle >= 0:
+            self._account(at_ns)
+            self._is_taken = self._sent_ns <= at_ns
+        deviation_ns = at_ns - self._sync_due_ns
+        lost = (deviation_ns + self.period_ns // 2) // self.period_ns
+        if lost > 0:
+            self._sync_due_ns += lost * self.period_ns
+            self._flags = int(SampleFlag.OVERRUN)
+            self._lose_syncs(lost, at_ns)
+        else:
+            self._flags = 0
+        if self.missing_syncs:
+            self._flags |= SampleFlag.SYNC_LOST
+            self.missing_syncs = 0
+        # A timer is late, never early.
+        late_ns = at_ns - self._sync_due_ns
+        self._sync_due_ns += late_ns if late_ns < 0 else late_ns // GRID_FILTER
+        self._begin(at_ns, deviation_ns)
+        return was_open
+
+    def receive_tpdo(self, number: int, data: bytes, now_ns: int) -> bool:
+        """Take the TPDO of axis ``number``; returns whether it closed the cycle.
+
+        After a cycle without its TPDO the next one of an axis may be that one, come late: it then counts only when a
+        second one comes in the same cycle, or at the deadline.
+        """
+        if len(data) != _TPDO_LENGTH:
+            return False
+        axis = self.axes[number]
+        axis.statusword, axis.actual, axis.torque = _unpack_tpdo(data)
+        bit = 1 << number
+        if self._doubtful & bit and not self._is_own(bit, now_ns):
+            return False
+        self._awaited &= ~bit
+        if self._awaited or self._is_closed:
+            return False
+        self._arrival_ns = now_ns
+        self._close(now_ns)
+        return True
+
+    def sent(self, now_ns: int) -> None:
+        """The host has handed all frames to the bus at this time."""
+        if self._is_closed:
+            self._sent_ns = now_ns
+
+    def note(self, flag: int) -> None:
+        """Something that the host has noticed in this cycle: a ``SampleFlag``."""
+        self._flags |= flag
+
+    def woke(self, lateness_ns: int) -> None:
+        """How late the host woke for this cycle, where that is not how late SYNC is."""
+        self._wake_lateness_ns = lateness_ns
+
+    def _is_own(self, bit: int, now_ns: int) -> bool:
+        """Whether the TPDO of a doubtful axis that has just come is certainly this cycle's."""
+        if not self._is_closed and not self._provisional & bit:
+            self._provisional |= bit
+            self._arrival_ns = now_ns
+            return False
+        self._doubtful &= ~bit
+        self._provisional &= ~bit
+        self._flags |= SampleFlag.LATE_TPDO
+        return True
+
+    def _miss_sync(self, now_ns: int) -> None:
+        self.missing_syncs += 1
+        self._flags |= SampleFlag.SYNC_LOST
+        # A host that was away has its timers late too: they are given another period from now on.
+        self._sync_due_ns = max(self._sync_due_ns, now_ns - self.period_ns // SYNC_PATIENCE) + self.period_ns
+        if self.missing_syncs >= SYNC_TAKE_OVER:
+            # Without SYNC no drive takes a demand, not even that of a stop.
+            self.is_paced = False
+            self._lose_syncs(max(self.missing_syncs, self.sync_gap_limit), now_ns)
+            self._sync_due_ns = now_ns
+            self._send_sync(now_ns)
+
+    def _lose_syncs(self, count: int, now_ns: int) -> None:
+        if count >= self.sync_gap_limit and self.phase is not _COMMISSIONING:
+            self.guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
+
+    def _send_sync(self, now_ns: int) -> None:
+        lateness_ns = now_ns - self._sync_due_ns
+        if self.cycle >= 0:
+            # An overrun moves the grid on; the demand's deadline is the SYNC that was due next.
+            self._account(self._sync_due_ns)
+        self.outbox.append(SYNC_FRAME)
+        self._flags = 0
+        self._is_taken = True
+        if self.missing_syncs:
+            self._flags = int(SampleFlag.SYNC_LOST)
+            self.missing_syncs = 0
+        if lateness_ns >= self.period_ns:
+            # Lost cycles are not made up for: two SYNCs at once would be worse for the drives than a gap.
+            self._flags |= int(SampleFlag.OVERRUN)
+            lost = lateness_ns // self.period_ns
+            self._sync_due_ns += lost * self.period_ns
+            self._lose_syncs(lost, now_ns)
+        self._begin(now_ns, lateness_ns)
+        self._wake_lateness_ns = lateness_ns
+
+    def _begin(self, sync_ns: int, deviation_ns: int) -> None:
+        """SYNC of the next cycle is on the bus."""
+        self._sync_due_ns += self.period_ns
+        self._sync_deviation_ns = deviation_ns
+        self._sync_period_ns = sync_ns - self._sync_ns
+        self._sync_ns = sync_ns
+        self._arrival_ns = sync_ns
+        self._sent_ns = 0
+        self.cycle += 1
+        self._awaited = self._all_axes
+        self._is_closed = False
+
+    def _close(self, now_ns: int) -> None:
+        """All TPDOs of this cycle are here, or overdue: guard, demand, RPDOs."""
+        self._is_closed = True
+        self._sent_ns = now_ns
+        self._awaited &= ~self._provisional
+        self._provisional = 0
+        self._doubtful = self._awaited
+        self._flags |= self._awaited
+        self.actuals_are_valid = not self._awaited
+        self._in_force = self._applied
+        if self._is_taken:
+            self._applied = self._sent
+        if self.phase is not _COMMISSIONING:
+            self._check(now_ns)
+        if self._observer is not None and not self._awaited:
+            self._show_errors(self._observer)
+        if self._is_coupled_stop_due:
+            self._begin_coupled_stop()
+        demand = self._demand
+        if demand is None:
+            for axis in self.axes:
+                # A drive that holds torque keeps its target: one that follows the actual position has no stiffness.
+                if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
+                    axis.target = axis.actual
+            nothing = self._no_torque_offsets
+            targets = list(map(_target_of, self.axes))
+            self._sent = (self._sent[0], 0.0, self._no_velocities, targets, nothing, self.phase)
+        elif self._is_taken:
+            # A demand that came too late is sent once more instead: two steps at once would be a jump.
+            demand.step()
+            self.phase = demand.phase
+            self._sent = (
+                demand.master_position,
+                demand.master_velocity,
+                demand.velocities,
+                demand.targets,
+                demand.torque_offsets,
+                demand.phase,
+            )
+        _, _, _, targets, torque_offsets, _ = self._sent
+        outbox = self.outbox
+        for number, axis in enumerate(self.axes):
+            axis.target = targets[number]
+            axis.torque_offset = torque_offsets[number]
+            payload = _pack_rpdo(axis.controlword, axis.target, axis.torque_offset)
+            outbox.append(Frame(axis.rpdo_cob_id, payload))
+
+    def _check(self, now_ns: int) -> None:
+        if self.phase is Phase.DISABLED:
+            # Drives without torque call for no reaction; which of them is there is asked all the same.
+            self._watch.note_silence(self._awaited)
+            return
+        master_position, _, _, targets, _, phase = self._in_force
+        self._watch.check(self._awaited, targets, master_position, phase, self.is_guarding_enabled, now_ns)
+        if self.guard.tripped:
+            self.react()
+
+    def _begin_coupled_stop(self) -> None:
+        self._is_coupled_stop_due = False
+        if self._coupled_stop is not None:
+            self._coupled_stop.begin(self._in_force[0], self._in_force[1], self._sent[3])
+            self._demand = self._coupled_stop
+
+    def _show_errors(self, observer: ErrorObserver) -> None:
+        position, velocity, _, targets, _, phase = self._in_force
+        errors = [
+            (target - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+            for target, axis in zip(targets, self.axes, strict=True)
+        ]
+        is_steady = phase is _CAM and self.guard.is_quiet
+        observer.observe(position, velocity, errors, is_steady)
+
+    def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:
+        cycles = self.guard.persistence(condition)
+        self.guard.hold(condition, number, cycles, cycles, now_ns)
+
+    def react(self) -> None:
+        """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
+        reaction = self.guard.reaction
+        if reaction is Reaction.QUICK_STOP or reaction is Reaction.DISABLE:
+            self.quick_stop()
+        elif reaction is Reaction.CONTROLLED_STOP:
+            self.controlled_stop()
+
+    def _account(self, deadline_ns: int) -> None:
+        """Hand on the sample of the cycle that ends with SYNC; ``deadline_ns`` is that of its demand."""
+        if self._cpu_clock is not None:
+            cpu_ns = self._cpu_clock()
+            self._cpu_ns = cpu_ns - self._cpu_last_ns if self._cpu_last_ns else 0
+            self._cpu_last_ns = cpu_ns
+        lead_ns = deadline_ns - self._sent_ns
+        if lead_ns < 0:
+            self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
+            self.guard.hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
+        elif not self.guard.is_quiet:
+            self.guard.clear(Condition.MISSED_DEADLINE, 0)
+        arrival_ns = self._arrival_ns - self._sync_ns
+        deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self._sync_period_ns, self._cpu_ns
+        spans_ns = (deviation_ns, period_ns, self._wake_lateness_ns, arrival_ns, lead_ns, cpu_ns)
+        if max(spans_ns) > INT32_MAX or min(spans_ns) < -INT32_MAX:
+            spans_ns = map(saturate_int32, spans_ns)
+        master_position, master_velocity, velocities, targets, torque_offsets, phase = self._in_force
+        axes = self.axes
+        self._sink.append(
+            self.cycle,
+            self._sync_ns,
+            master_position,
+            master_velocity,
+            *velocities,
+            *spans_ns,
+            phase,
+            self._flags,
+            *targets,
+            *map(_actual_of, axes),
+            *map(_statusword_of, axes),
+            *map(_torque_of, axes),
+            *torque_offsets,
+        )

@@ -1,0 +1,153 @@
+"""The quick stop of a coupled machine: no axis is stopped, or lost, without the other one taking notice of it.
+
+The master is stopped by its own drive (605Ah), as fast as its ramp 6085h allows, whether it is the one that failed or
+not. The slave, as long as it has torque, stays on the cam of where the master *is*, and is stopped when the master
+stands. A master that cannot be seen, because its TPDOs have stopped or its resolver has, is taken to follow that ramp.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Final
+
+from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.guard import Guard
+from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK
+from gateway.record.sample import Phase
+from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
+from mechanism.slave_law import SlaveLaw
+
+REACHED_AFTER_CYCLES: Final = 2
+"""A target sent now is applied at the next SYNC and reached at the one after it."""
+BLEND_S: Final = 0.02
+"""Within this the slave's target goes over from the demand that was to the cam of the actual position."""
+STANDSTILL_S: Final = 0.05
+STANDSTILL_COUNTS: Final = 2
+POSITION_GAIN: Final = 0.7
+VELOCITY_GAIN: Final = 0.4
+"""Of the observer of the master: shares of the difference to the actual position, the second one per cycle."""
+
+MASTER: Final = 0
+SLAVE: Final = 1
+
+
+class CoupledStop:
+    """A `gateway.cyclic.demand.Demand` for two axes, master first, that takes over from the one that was followed."""
+
+    def __init__(
+        self, law: SlaveLaw, axes: Sequence[AxisChannel], guard: Guard, period_s: float, deceleration: float
+    ) -> None:
+        """``deceleration`` (rad/s^2): of the master's quick stop ramp, for as long as it cannot be seen."""
+        self._law = law
+        self._master, self._slave = axes
+        self._guard = guard
+        self._period_s = period_s
+        self._deceleration = deceleration
+        self._rad_per_count = math.tau / self._master.units.counts_per_revolution
+        self._blend_cycles = max(round(BLEND_S / period_s), 1)
+        self._standstill_cycles = max(round(STANDSTILL_S / period_s), 1)
+        self._cycle = 0
+        self._offset = 0
+        self._turns = 0
+        self._seen = 0
+        """Actual value of the master that was seen last, in counts, and where it was then, in rad."""
+        self._seen_position = 0.0
+        self._unseen_cycles = 0
+        self._rest_from = 0
+        self._rest_cycles = 0
+        self.targets = [0, 0]
+        self.torque_offsets = [0, 0]
+        self.velocities = [0.0, 0.0]
+        self.master_position = 0.0
+        self.master_velocity = 0.0
+        self.phase = Phase.QUICK_STOP
+        self.is_finished = False
+        """The master stands, and the slave's drive has been told to stop too."""
+
+    def begin(self, master_position: float, master_velocity: float, targets: Sequence[int]) -> None:
+        """Take over with the next step.
+
+        ``master_position`` (rad, unwrapped) and ``master_velocity`` (rad/s) are the demand's at the last SYNC, and
+        ``targets`` (counts) what the axes were sent last.
+        """
+        master, slave = self._master, self._slave
+        self.targets = list(targets)
+        self._cycle = 0
+        self._unseen_cycles = 0
+        self._rest_cycles = 0
+        self.is_finished = False
+        revolution = master.units.counts_per_revolution
+        behind = math.remainder(master.units.counts(master_position) - master.actual, revolution)
+        self._seen = self._rest_from = master.actual
+        self._seen_position = master_position - behind * self._rad_per_count
+        position = self._seen_position if self._is_seen() else master_position
+        # The first step goes on from the cycle before this one.
+        self.master_position = position - master_velocity * self._period_s
+        self.master_velocity = master_velocity
+        revolution = slave.units.counts_per_revolution
+        ahead = position + master_velocity * REACHED_AFTER_CYCLES * self._period_s
+        away = wrap_counts(targets[SLAVE] - slave.units.counts(self._law.at(ahead)[0]))
+        # The turns by which the slave stands away from the cam's first one stay what they were.
+        self._turns = round(away / revolution) * revolution
+        self._offset = away - self._turns
+        master.controlword = COMMAND_QUICK_STOP
+
+    def step(self) -> None:
+        """One cycle; see ``gateway.cyclic.demand.Demand``."""
+        self._cycle += 1
+        disabled = self._guard.disabled
+        master, slave = self._master, self._slave
+        self._observe()
+        if disabled >> MASTER & 1:
+            master.controlword = COMMAND_DISABLE_VOLTAGE
+        if disabled >> SLAVE & 1:
+            slave.controlword = COMMAND_DISABLE_VOLTAGE
+        elif self.is_finished or self._is_lost(slave):
+            slave.controlword = COMMAND_QUICK_STOP
+        if self.is_finished:
+            return
+        ahead = self.master_position + self.master_velocity * REACHED_AFTER_CYCLES * self._period_s
+        theta5, slope = self._law.at(ahead)
+        left = max(1.0 - self._cycle / self._blend_cycles, 0.0)
+        target = slave.units.counts(theta5) + self._turns + round(left * left * (3.0 - 2.0 * left) * self._offset)
+        # New lists: whoever keeps the last ones keeps that step's values.
+        self.targets = [self.targets[MASTER], wrap_counts(target)]
+        self.velocities = [self.master_velocity, slope * self.master_velocity]
+        self.is_finished = self._rest_cycles >= self._standstill_cycles
+
+    def controlled_stop(self) -> None:
+        """Nothing: this is a stop, and a stronger one."""
+
+    def _is_seen(self) -> bool:
+        return self._master.silent_cycles == 0 and not self._guard.disabled >> MASTER & 1
+
+    @staticmethod
+    def _is_lost(axis: AxisChannel) -> bool:
+        return axis.silent_cycles == 0 and axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED
+
+    def _observe(self) -> None:
+        """Bring position and velocity of the master up to the last SYNC."""
+        period_s = self._period_s
+        expected = self.master_position + self.master_velocity * period_s
+        if not self._is_seen():
+            slower = max(abs(self.master_velocity) - self._deceleration * period_s, 0.0)
+            self.master_velocity = math.copysign(slower, self.master_velocity)
+            self.master_position += self.master_velocity * period_s
+            self._rest_cycles = self._rest_cycles + 1 if slower == 0.0 else 0
+            self._unseen_cycles += 1
+            return
+        actual = self._master.actual
+        # From the last count seen to this one, and from there to where the observer has the master.
+        moved = (actual - self._seen + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        self._seen = actual
+        self._seen_position += moved * self._rad_per_count
+        miss = self._seen_position - expected
+        self.master_position = expected + POSITION_GAIN * miss
+        # A miss that has grown for several cycles says so much less of the velocity: else rare sights make it swing up.
+        self.master_velocity += VELOCITY_GAIN * miss / (period_s * (self._unseen_cycles + 1))
+        self._unseen_cycles = 0
+        if abs(wrap_counts(actual - self._rest_from)) > STANDSTILL_COUNTS:
+            self._rest_from = actual
+            self._rest_cycles = 0
+        else:
+            self._rest_cycles += 1

@@ -1,0 +1,1 @@
+"""Learning from cycle to cycle: the law and its arithmetic, and what is kept of it between runs."""

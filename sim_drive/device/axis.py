@@ -1,0 +1,664 @@
+"""The drive's application: the CiA 402 device behind the object dictionary.
+
+The axis keeps the power state machine, statusword and controlword, the following error and what a SYNC samples; what a
+mode of operation does with set-points is in `modes`, and what the two share in `motion`.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from config.quirks import Quirk
+from drivers import objects
+from drivers.node import Event
+from drivers.sdo import AbortCode
+from sim_drive.communication.dictionary import Entry, LiveDictionary
+from sim_drive.communication.emcy import AxisErrors, EmergencyCode, ErrorRegister
+from sim_drive.device.cam_slots import CamSlots
+from sim_drive.device.cia402 import (
+    COMMANDS,
+    MODES,
+    QUICK_STOP_STAYS,
+    STATE_BITS,
+    STOP_RAMPS,
+    AbortConnection,
+    Controlword,
+    Mode,
+    PowerCommand,
+    PowerState,
+    PowerStateChanged,
+    Statusword,
+    StopRamp,
+    next_state,
+)
+from sim_drive.device.measured import MeasuredMotion
+from sim_drive.device.modes.base import Holding, OperationMode
+from sim_drive.device.modes.camming import Camming
+from sim_drive.device.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
+from sim_drive.device.modes.homing import Homing, HomingStatus
+from sim_drive.device.modes.interpolated import InterpolatedPosition
+from sim_drive.device.modes.profile_position import ProfilePosition
+from sim_drive.device.modes.profile_torque import ProfileTorque
+from sim_drive.device.modes.profile_velocity import ProfileVelocity
+from sim_drive.device.motion import Latch, SetPointSource, wrap_int32
+from sim_drive.device.quirks import MODE_SWITCH_NS, SYNC_PATIENCE_NS
+from sim_drive.device.touch_probe import TouchProbe
+from sim_drive.settings import DriveSettings
+from sim_drive.switches import DigitalInput
+
+__all__ = ["CONTROLLER_GAIN_COUNT", "FOLLOWING_ERROR_WINDOW_OFF", "Axis", "Latch", "SetPointSource", "wrap_int32"]
+
+FOLLOWING_ERROR_WINDOW_OFF: Final = 0xFFFFFFFF
+CONTROLLER_GAIN_COUNT: Final = 5
+
+_HALF: Final = 1 << 31
+_NS_PER_MS: Final = 1_000_000
+_NS_PER_US: Final = 1_000
+
+_BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
+_FOLLOWING_ERROR: Final = int(Statusword.FOLLOWING_ERROR)
+_LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
+_FROZEN: Final = int(Statusword.FROZEN)
+_FAULT_RESET: Final = int(Controlword.FAULT_RESET)
+_HALT: Final = int(Controlword.HALT)
+_OPTION_CODES: Final = {
+    PowerState.SWITCHED_ON: objects.DISABLE_OPERATION_OPTION_CODE,
+    PowerState.READY_TO_SWITCH_ON: objects.SHUTDOWN_OPTION_CODE,
+}
+"""How the axis stops on its way from Operation enabled to these states."""
+_DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
+# Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
+_OPERATION_ENABLED: Final = PowerState.OPERATION_ENABLED
+_NO_CONTROLWORD: Final = -1
+_TIMED_MODES: Final = frozenset(
+    {
+        Mode.CYCLIC_SYNCHRONOUS_POSITION,
+        Mode.CYCLIC_SYNCHRONOUS_VELOCITY,
+        Mode.CYCLIC_SYNCHRONOUS_TORQUE,
+        Mode.INTERPOLATED_POSITION,
+        Mode.CAMMING,
+    }
+)
+"""Modes in which the interpolation time must not change."""
+
+
+class Axis(MeasuredMotion):
+    """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it.
+
+    A ramp before a state is left (605Bh, 605Ch) is run in the state; enabling the operation again calls it off.
+    """
+
+    __slots__ = (
+        "_active",
+        "_after_ramp",
+        "_coming_mode",
+        "_cycle_period",
+        "_enabled_bits",
+        "_errors",
+        "_events",
+        "_following_error_since_ns",
+        "_following_error_timeout",
+        "_following_error_window",
+        "_freezes",
+        "_gain_entries",
+        "_has_stops",
+        "_homing",
+        "_idle_controlword",
+        "_interpolation_exponent",
+        "_interpolation_value",
+        "_mode",
+        "_mode_display",
+        "_mode_entry",
+        "_modes",
+        "_rated_torque_Nm",
+        "_state",
+        "_statusword",
+        "_synced_at_ns",
+        "_ticking",
+        "_torque_limits",
+        "_torque_offset",
+        "_touch_probe",
+        "gains",
+        "is_frozen",
+        "is_switched_off",
+        "negative_torque_limit_Nm",
+        "node_id",
+        "on_sync",
+        "position_demand_counts",
+        "torque_limit_Nm",
+    )
+
+    def __init__(
+        self,
+        node_id: int,
+        dictionary: LiveDictionary,
+        settings: DriveSettings,
+        slots: CamSlots,
+        errors: AxisErrors,
+        events: list[Event],
+        number: int = 1,
+    ) -> None:
+        super().__init__(dictionary, settings, number)
+        self.node_id = node_id
+        """For its events alone; the drive changes it when it gets another one."""
+        self._errors = errors
+        self._events = events
+
+        entry = self.entry
+        self._statusword = entry(objects.STATUSWORD)
+        self._mode_entry = entry(objects.MODES_OF_OPERATION)
+        self._mode_display = entry(objects.MODES_OF_OPERATION_DISPLAY)
+        self._torque_offset = entry(objects.TORQUE_OFFSET)
+        self._following_error_window = entry(objects.FOLLOWING_ERROR_WINDOW)
+        self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
+        self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
+        self._interpolation_exponent = entry(objects.INTERPOLATION_TIME_PERIOD, 2)
+        self._torque_limits = (
+            entry(objects.MAX_TORQUE),
+            entry(objects.POSITIVE_TORQUE_LIMIT),
+            entry(objects.NEGATIVE_TORQUE_LIMIT),
+        )
+        self.torque_limit_Nm = 0.0
+        """What max torque 6072h and the positive torque limit 60E0h allow."""
+        self.negative_torque_limit_Nm = 0.0
+        """What 6072h and 60E1h allow in the negative direction, as a positive number."""
+        self._gain_entries = [entry(objects.CONTROLLER_GAINS, n + 1) for n in range(CONTROLLER_GAIN_COUNT)]
+        self._rated_torque_Nm = settings.rated_torque_Nm
+        self._touch_probe = TouchProbe(self)
+        self._set_defaults()
+        self._set_hooks()
+
+        self._homing = Homing(self)
+        self._modes: dict[Mode, OperationMode] = {
+            Mode.NONE: Holding(self),
+            Mode.HOMING: self._homing,
+            Mode.PROFILE_POSITION: ProfilePosition(self),
+            Mode.PROFILE_VELOCITY: ProfileVelocity(self),
+            Mode.PROFILE_TORQUE: ProfileTorque(self),
+            Mode.INTERPOLATED_POSITION: InterpolatedPosition(self),
+            Mode.CYCLIC_SYNCHRONOUS_POSITION: CyclicPosition(self),
+            Mode.CYCLIC_SYNCHRONOUS_VELOCITY: CyclicVelocity(self),
+            Mode.CYCLIC_SYNCHRONOUS_TORQUE: CyclicTorque(self),
+            Mode.CAMMING: Camming(self, slots),
+        }
+        self._active: OperationMode | None = None
+        """The selected mode while operation is enabled."""
+        self._ticking: OperationMode | None = None
+        """The active mode if it has something to do at every servo tick."""
+        self.on_sync: Callable[[int], None] = _nothing
+        """Let the set-points that the synchronous RPDOs have brought act: the active mode's own."""
+        self._idle_controlword = _NO_CONTROLWORD
+        """The controlword that asks, as the one before it, for nothing new in the present state and mode."""
+        self.position_demand_counts = 0.0
+        """Demand at the last servo tick, shaft frame."""
+        self._state = PowerState.NOT_READY_TO_SWITCH_ON
+        self._mode = Mode.NONE
+        self.is_switched_off = False
+        """Without supply, as the drive has it."""
+        self._after_ramp: PowerState | None = None
+        """The state that is next when the axis has come to rest."""
+        self._following_error_since_ns: int | None = None
+        self._coming_mode: tuple[int, int] | None = None
+        """With a slow mode switch: the mode, and when it is entered."""
+        has_limit_switches = bool(settings.switches.fitted & ~DigitalInput.HOME)
+        self._has_stops = has_limit_switches or Quirk.LATE_SYNC_FREEZES in settings.quirks
+        self._freezes = Quirk.LATE_SYNC_FREEZES in settings.quirks
+        self._cycle_period = dictionary.entry(objects.COMMUNICATION_CYCLE_PERIOD)
+        self._synced_at_ns: int | None = None
+        self.is_frozen = False
+        """With the habit of freezing: whether a SYNC is late."""
+        is_odd = Quirk.SET_POINT_ACKNOWLEDGE_STAYS in settings.quirks
+        self._enabled_bits = int(Statusword.SET_POINT_ACKNOWLEDGE) if is_odd else 0
+        """Set in the statusword whenever operation is enabled."""
+        self.gains: tuple[int, ...] = ()
+        self.restore()
+
+    # -- set-up --------------------------------------------------------------------------------------------------
+
+    def _set_defaults(self) -> None:
+        settings = self.settings
+        defaults = {
+            (objects.POSITION_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
+            (objects.VELOCITY_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
+            (objects.FEED_CONSTANT, 1): settings.counts_per_revolution,
+            (objects.MOTOR_RATED_TORQUE, 0): round(settings.rated_torque_Nm * 1000.0),
+        }
+        if settings.gains is not None:
+            if len(settings.gains) != CONTROLLER_GAIN_COUNT:
+                raise ValueError(f"a drive has {CONTROLLER_GAIN_COUNT} gains, not {len(settings.gains)}")
+            defaults |= {(objects.CONTROLLER_GAINS, n + 1): gain for n, gain in enumerate(settings.gains)}
+        for (index, subindex), value in defaults.items():
+            entry = self.entry(index, subindex)
+            entry.default = value
+            entry.value = value
+
+    def _set_hooks(self) -> None:
+        self.controlword.on_write = self._on_controlword
+        self._mode_entry.on_write = self._on_mode
+        self._interpolation_value.on_write = self._on_interpolation_value
+        self._interpolation_exponent.on_write = self._on_interpolation_exponent
+        for entry in (*self._scale_entries, self.entry(objects.POLARITY)):
+            entry.on_write = self._scaling_writer(entry)
+        for place, entry in enumerate(self._torque_limits):
+            entry.on_write = self._torque_limit_writer(place)
+        for place, entry in enumerate(self._gain_entries):
+            entry.on_write = self._gain_writer(place)
+
+    def _scaling_writer(self, entry: Entry) -> Callable[[int, int], AbortCode | None]:
+        def write(value: int, now_ns: int) -> AbortCode | None:
+            if self.is_powered:
+                return AbortCode.CANNOT_STORE_DEVICE_STATE
+            self.set_scaling(entry, value)
+            return None
+
+        return write
+
+    def _gain_writer(self, place: int) -> Callable[[int, int], AbortCode | None]:
+        def write(value: int, now_ns: int) -> AbortCode | None:
+            self.gains = (*self.gains[:place], value, *self.gains[place + 1 :])
+            return None
+
+        return write
+
+    def restore(self) -> None:
+        """Power-on state, from the values that the dictionary holds; the offset of the last homing is lost."""
+        self._state = PowerState.NOT_READY_TO_SWITCH_ON
+        self._mode = Mode.NONE
+        self._after_ramp = None
+        self._activate(0)
+        self.torque_demand = None
+        for mode in self._modes.values():
+            mode.reset()
+        self._touch_probe.restore()
+        self._idle_controlword = _NO_CONTROLWORD
+        self.set_scaling()
+        self.offset = self.settings.initial_offset_counts
+        self.power(False)
+        self.internal_bits = 0
+        self._following_error_since_ns = None
+        self._sampled_at_ns = -1
+        self.gains = tuple(entry.value for entry in self._gain_entries)
+        self._limit_torque(*(entry.value for entry in self._torque_limits))
+        self.set_period(self._interpolation_value.value, self._interpolation_exponent.value)
+        self.demand.hold(float(self.shaft_counts))
+        self.show_status()
+
+    # -- what the machine reads ----------------------------------------------------------------------------------
+
+    @property
+    def state(self) -> PowerState:
+        """State of the power drive system."""
+        return self._state
+
+    @property
+    def mode(self) -> Mode:
+        """Active mode of operation, as 6061h shows it."""
+        return self._mode
+
+    @property
+    def is_homed(self) -> bool:
+        """Whether homing has been attained since power-on."""
+        return self._homing.status is HomingStatus.ATTAINED
+
+    @property
+    def offset_counts(self) -> int:
+        """Position actual value minus shaft counts, before the wrap to INTEGER32."""
+        return self.offset
+
+    @property
+    def torque_offset_Nm(self) -> float:  # noqa: N802 - the unit is part of the name
+        """Torque offset 60B2h, to be added to the controller's torque; 0 unless operation is enabled."""
+        if self._state is not _OPERATION_ENABLED:
+            return 0.0
+        return self._torque_offset.value * 0.001 * self._rated_torque_Nm
+
+    @property
+    def torque_demand_Nm(self) -> float | None:  # noqa: N802 - the unit is part of the name
+        """Torque that a torque mode asks for, within its limits; None where the position controller decides.
+
+        A limit switch lets no torque pass that would drive the axis further on.
+        """
+        demand = self.torque_demand
+        if demand is None or not self.is_powered:
+            return None
+        torque = demand * 0.001 * self._rated_torque_Nm
+        if self.barred and self.is_barred(torque):
+            return 0.0
+        return max(-self.negative_torque_limit_Nm, min(self.torque_limit_Nm, torque))
+
+    def _limit_torque(self, maximum: int, positive: int, negative: int) -> None:
+        permille_Nm = 0.001 * self._rated_torque_Nm
+        self.torque_limit_Nm = min(maximum, positive) * permille_Nm
+        self.negative_torque_limit_Nm = min(maximum, negative) * permille_Nm
+
+    def _torque_limit_writer(self, place: int) -> Callable[[int, int], AbortCode | None]:
+        def write(value: int, now_ns: int) -> AbortCode | None:
+            bounds: list[int] = [entry.value for entry in self._torque_limits]
+            bounds[place] = value
+            self._limit_torque(*bounds)
+            return None
+
+        return write
+
+    # -- the servo tick ------------------------------------------------------------------------------------------
+
+    def on_tick(self, now_ns: int, shaft_counts: int) -> None:
+        """One servo period: bring the demand up to ``now_ns`` and run what depends on time."""
+        self.shaft_counts = shaft_counts
+        if self._touch_probe.is_enabled:
+            self._touch_probe.on_tick()
+        if self._mode_entry.value != self._mode and self._is_mode_due(now_ns):
+            self._switch_mode(now_ns)
+        state = self._state
+        if not self.is_powered:
+            self._tick_without_power(now_ns)
+            return
+        demand = self.demand.at(now_ns)
+        self.position_demand_counts = demand
+        if self._active is not None:
+            if self._has_stops:
+                self._look_for_stops(now_ns)
+                demand = self.demand.at(now_ns)
+            if self.is_guarded and now_ns - self.set_point_at_ns > self.set_point_timeout_ns:
+                self.trip(EmergencyCode.SYNC_CONTROLLER, _DRIVE_ERROR, now_ns)
+                return
+            if self._ticking is not None:
+                self._ticking.on_tick(now_ns)
+                self.position_demand_counts = demand = self.demand.at(now_ns)
+        elif self.demand.is_over(now_ns):
+            if state is PowerState.FAULT_REACTION_ACTIVE:
+                self._go_to_state(PowerState.FAULT, now_ns)
+                return
+            if self._after_ramp is not None:
+                self._go_to_state(self._after_ramp, now_ns)
+                return
+        window = self._following_error_window.value
+        error = (demand - shaft_counts) * self.unit
+        if self._following_error_since_ns is not None or not -window <= error <= window:
+            self._guard_following_error(error, now_ns)
+
+    def _tick_without_power(self, now_ns: int) -> None:
+        if self.is_switched_off:
+            return
+        state = self._state
+        shaft_counts = self.shaft_counts
+        self.position_demand_counts = float(shaft_counts)
+        self.demand.hold(float(shaft_counts))
+        if state is PowerState.NOT_READY_TO_SWITCH_ON:
+            # A fault whose cause has outlived a reset is a fault again.
+            is_healthy = not self._errors.has_persisting_fault
+            ready = PowerState.SWITCH_ON_DISABLED if is_healthy else PowerState.FAULT_REACTION_ACTIVE
+            self._go_to_state(ready, now_ns)
+        elif state is PowerState.FAULT_REACTION_ACTIVE:
+            self._go_to_state(PowerState.FAULT, now_ns)
+
+    def _guard_following_error(self, error: float, now_ns: int) -> None:
+        window = self._following_error_window.value
+        if -window <= error <= window or window == FOLLOWING_ERROR_WINDOW_OFF:
+            if self._following_error_since_ns is not None:
+                self._following_error_since_ns = None
+                self.set_internal_bit(_FOLLOWING_ERROR, False)
+            return
+        if self._following_error_since_ns is None:
+            self._following_error_since_ns = now_ns
+        timeout_ns = self._following_error_timeout.value * _NS_PER_MS
+        if now_ns - self._following_error_since_ns < timeout_ns or self.internal_bits & _FOLLOWING_ERROR:
+            return
+        self.set_internal_bit(_FOLLOWING_ERROR, True)
+        self.trip(EmergencyCode.FOLLOWING_ERROR, _DRIVE_ERROR, now_ns)
+
+    # -- controlword and state -----------------------------------------------------------------------------------
+
+    def _on_controlword(self, value: int, now_ns: int) -> AbortCode | None:
+        if value == self._idle_controlword:
+            return None
+        self._idle_controlword = _NO_CONTROLWORD
+        before: int = self.controlword.value
+        if value & ~before & _FAULT_RESET and self._state is PowerState.FAULT:
+            if not self._errors.has_persisting_fault:
+                self._errors.reset_fault(now_ns)
+                self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
+            return None
+        command = COMMANDS[value & 0xFF]
+        state = self._state
+        self._execute(command, now_ns)
+        if command is PowerCommand.ENABLE_OPERATION and state is PowerState.READY_TO_SWITCH_ON:
+            self._execute(command, now_ns)
+        active = self._active
+        if active is not None:
+            active.on_controlword(value, now_ns)
+            is_halted = bool(value & _HALT)
+            if is_halted is not self.is_halted and self._active is active:
+                self.is_halted = is_halted
+                if is_halted:
+                    active.halt(now_ns)
+                else:
+                    active.resume(now_ns)
+                self.show_status()
+        if value == before and next_state(self._state, command) is self._state:
+            self._idle_controlword = value
+        return None
+
+    def _execute(self, command: PowerCommand, now_ns: int) -> None:
+        state = self._state
+        after = next_state(state, command)
+        if state is not _OPERATION_ENABLED:
+            # There is no way back from a quick stop that is to end in another state (transition 16).
+            if after is not state and (after is not _OPERATION_ENABLED or self._after_ramp is None):
+                self._go_to_state(after, now_ns)
+            return
+        if after is state:
+            if command is PowerCommand.ENABLE_OPERATION and self._after_ramp is not None:
+                self._after_ramp = None
+                self._activate(now_ns)
+                self.show_status()
+            return
+        if after is PowerState.QUICK_STOP_ACTIVE:
+            self._quick_stop(now_ns)
+            return
+        index = _OPTION_CODES.get(after)
+        if index is not None and self._option(index) is not StopRamp.NONE:
+            if self._after_ramp is None:
+                self._stop(StopRamp.SLOW_DOWN, now_ns)
+                self.show_status()
+            if not self.demand.is_over(now_ns):
+                self._after_ramp = after
+                return
+        self._go_to_state(after, now_ns)
+
+    def _quick_stop(self, now_ns: int) -> None:
+        code: int = self.entry(objects.QUICK_STOP_OPTION_CODE).value
+        if code == StopRamp.NONE:
+            self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
+            return
+        stays = code >= QUICK_STOP_STAYS
+        self._stop(STOP_RAMPS[code - QUICK_STOP_STAYS + 1 if stays else code], now_ns)
+        self._go_to_state(PowerState.QUICK_STOP_ACTIVE, now_ns)
+        self._after_ramp = None if stays else PowerState.SWITCH_ON_DISABLED
+
+    def _option(self, index: int) -> StopRamp:
+        value: int = self.entry(index).value
+        return STOP_RAMPS[value]
+
+    def _stop(self, ramp: StopRamp, now_ns: int) -> None:
+        """Leave the active mode, and let the demand come to rest."""
+        self._deactivate(now_ns)
+        self.brake(self.deceleration_of(ramp), now_ns)
+
+    def lose_connection(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
+        """The master is gone: EMCY, and, if the axis is enabled, what the option code 6007h says."""
+        action: int = self.entry(objects.ABORT_CONNECTION_OPTION_CODE).value if self.is_powered else 0
+        if action == AbortConnection.FAULT:
+            self.trip(error_code, register_bits, now_ns, persists=persists)
+            return
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=persists)
+        if action == AbortConnection.DISABLE_VOLTAGE:
+            self._execute(PowerCommand.DISABLE_VOLTAGE, now_ns)
+        elif action == AbortConnection.QUICK_STOP:
+            self._execute(PowerCommand.QUICK_STOP, now_ns)
+        self._idle_controlword = _NO_CONTROLWORD
+
+    def _go_to_state(self, state: PowerState, now_ns: int) -> None:
+        before = self._state
+        if state is before:
+            return
+        self._state = state
+        self._after_ramp = None
+        self._idle_controlword = _NO_CONTROLWORD
+        self._events.append(PowerStateChanged(now_ns, self.node_id, before, state, self.number))
+        was_powered = self.is_powered
+        self.power(
+            state is PowerState.OPERATION_ENABLED
+            or (was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE})
+        )
+        if not self.is_powered or not was_powered:
+            self.demand.hold(float(self.shaft_counts))
+            self.position_demand_counts = float(self.shaft_counts)
+            self._following_error_since_ns = None
+        if before is PowerState.FAULT or state is PowerState.OPERATION_ENABLED:
+            self.internal_bits = 0
+        self._activate(now_ns)
+        self._sampled_at_ns = -1
+        self.show_status()
+
+    def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
+        """Raise an error that leads to a fault: EMCY at once, then the fault reaction 605Eh, then the state fault.
+
+        ``persists``: no fault reset is accepted until ``end_warning`` is called. An axis without supply notices nothing
+        but a cause that persists, once it has one again.
+        """
+        if self.is_switched_off:
+            if persists:
+                self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=True)
+            return
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=persists)
+        if self._state in {PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT}:
+            return
+        if self.is_powered:
+            ramp = self._option(objects.FAULT_REACTION_OPTION_CODE)
+            if ramp is StopRamp.NONE:
+                self.power(False)
+            elif self._state is PowerState.OPERATION_ENABLED:
+                self._stop(ramp, now_ns)
+        self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)
+
+    def warn(self, error_code: int, register_bits: int, now_ns: int) -> None:
+        """Raise an error that leads to no fault: EMCY alone."""
+        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=False)
+
+    def end_warning(self, error_code: int, now_ns: int) -> None:
+        """The cause of an error is gone; a fault that it has led to is still to be reset."""
+        self._errors.end_cause(error_code, now_ns)
+
+    # -- modes ---------------------------------------------------------------------------------------------------
+
+    def _on_mode(self, value: int, now_ns: int) -> AbortCode | None:
+        return None if value in MODES else AbortCode.VALUE_RANGE_EXCEEDED
+
+    def _is_mode_due(self, now_ns: int) -> bool:
+        """Whether the mode that 6060h asks for is to be entered now; a slow drive takes its time."""
+        if Quirk.SLOW_MODE_SWITCH not in self.settings.quirks:
+            return True
+        wanted: int = self._mode_entry.value
+        if self._coming_mode is None or self._coming_mode[0] != wanted:
+            self._coming_mode = wanted, now_ns + MODE_SWITCH_NS
+        if now_ns < self._coming_mode[1]:
+            return False
+        self._coming_mode = None
+        return True
+
+    def _switch_mode(self, now_ns: int) -> None:
+        self._mode = MODES[self._mode_entry.value]
+        self._idle_controlword = _NO_CONTROLWORD
+        self.internal_bits &= ~_LIMITED
+        self._activate(now_ns)
+        self.show_status()
+
+    def _deactivate(self, now_ns: int) -> None:
+        active = self._active
+        self._active = None
+        self._ticking = None
+        self.on_sync = _nothing
+        self.is_guarded = False
+        self.is_halted = False
+        self.barred = 0
+        self.is_at_switch = False
+        self.is_frozen = False
+        self._synced_at_ns = None
+        if active is not None:
+            active.leave(now_ns)
+
+    def _activate(self, now_ns: int) -> None:
+        """Leave the mode that was active, and enter the selected one if operation is enabled."""
+        self._deactivate(now_ns)
+        if self._state is not _OPERATION_ENABLED or self._after_ramp is not None:
+            return
+        mode = self._modes[self._mode]
+        self._active = mode
+        self._ticking = mode if mode.is_ticking else None
+        self.on_sync = mode.on_sync
+        if self._freezes and self._mode in _TIMED_MODES:
+            self.on_sync = self._watch_sync(mode)
+        self.is_halted = bool(self.controlword.value & _HALT)
+        mode.enter(now_ns)
+        if self.is_halted and self._active is mode:
+            mode.halt(now_ns)
+
+    # -- the habit of freezing when a SYNC is late ------------------------------------------------------------------
+
+    def _watch_sync(self, mode: OperationMode) -> Callable[[int], None]:
+        def on_sync(now_ns: int) -> None:
+            self._synced_at_ns = now_ns
+            if self.is_frozen:
+                self.is_frozen = False
+                self.show_status()
+            mode.on_sync(now_ns)
+
+        return on_sync
+
+    def _look_for_stops(self, now_ns: int) -> None:
+        if self._freezes:
+            self._freeze_if_late(now_ns)
+        self.look_at_switches(now_ns, self._mode is Mode.HOMING)
+
+    def _freeze_if_late(self, now_ns: int) -> None:
+        cycle_ns: int = self._cycle_period.value * _NS_PER_US
+        if self._synced_at_ns is None or not cycle_ns or self.is_frozen:
+            return
+        if now_ns - self._synced_at_ns > cycle_ns + SYNC_PATIENCE_NS:
+            self.is_frozen = True
+            self.demand.hold(self.demand.at(now_ns))
+            self.show_status()
+
+    # -- interpolation time 60C2h --------------------------------------------------------------------------------
+
+    def _on_interpolation_value(self, value: int, now_ns: int) -> AbortCode | None:
+        return self._change_period(value, self._interpolation_exponent.value)
+
+    def _on_interpolation_exponent(self, value: int, now_ns: int) -> AbortCode | None:
+        return self._change_period(self._interpolation_value.value, value)
+
+    def _change_period(self, value: int, exponent: int) -> AbortCode | None:
+        if self._active is not None and self._mode in _TIMED_MODES:
+            return AbortCode.CANNOT_STORE_DEVICE_STATE
+        self.set_period(value, exponent)
+        return None
+
+    # -- statusword ----------------------------------------------------------------------------------------------
+
+    def show_status(self) -> None:
+        """Compose statusword and modes of operation display."""
+        mode = self._modes[self._mode]
+        internal = self.internal_bits & _LIMITED if mode.owns_bit_13 else self.internal_bits
+        word = STATE_BITS[self._state] | _BASE_BITS | internal | mode.status_bits
+        if self._state is _OPERATION_ENABLED:
+            word |= self._enabled_bits
+        if self.is_at_switch:
+            word |= _LIMITED
+        if self.is_frozen:
+            word |= _FROZEN
+        self._statusword.value = word
+        self._mode_display.value = int(self._mode)
+
+
+def _nothing(now_ns: int) -> None:
+    pass
