@@ -57,7 +57,7 @@ class FrictionLaw(Enum):
 
 
 class DemandRounding(Enum):
-    """Where the position controller rounds its demand to counts; see `sim_drive.servo.DemandResolution`."""
+    """Where the position controller rounds its demand to counts; see `sim_drive.physics.servo.DemandResolution`."""
 
     COUNTS = "counts"
     """In the error and in the difference that K_F multiplies: the paper's eq. (5) to the letter."""

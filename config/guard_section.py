@@ -122,7 +122,7 @@ class GuardSection(Model):
     """The torque actual value, either way."""
     end_effector_error: LengthCondition = LengthCondition(limit_mm=50.0, persistence_cycles=5, reaction=_QUICK)
     """Distance of the end effector from where the demand has it."""
-    frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, reaction=_DISABLE)
+    frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, persistence_cycles=3, reaction=_DISABLE)
     """The demand has gone so far while the actual value has not changed by a single count."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
     axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)

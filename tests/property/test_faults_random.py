@@ -93,7 +93,7 @@ class Chatter:
         return []
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(st.lists(faults(), max_size=12), st.integers(0, 2**32))
 def test_after_all_faults_the_drives_answer_as_ever(drawn: list[Fault], seed: int) -> None:
     """What began has ended; after a reset of all nodes they boot, and are who they are."""

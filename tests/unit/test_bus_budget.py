@@ -58,11 +58,10 @@ def test_cycles_that_60c2h_can_say(cycle_us, representable):
 def test_the_cycle_that_would_fit_fits_and_no_shorter_one_does(axes, bit_rate, sdo_frames, heartbeat_ms):
     shortest = bus_budget(axes, 1000, bit_rate, heartbeat_ms, sdo_frames).shortest_cycle_us
     assert bus_budget(axes, shortest, bit_rate, heartbeat_ms, sdo_frames).is_within_bound
-    unit = 1
-    while shortest % (unit * 10) == 0 and shortest // unit > 255:
-        unit *= 10
-    shorter = shortest - unit if shortest // unit > 26 else shortest - max(unit // 10, 1)
-    if shorter >= 1:
+    # What 60C2h can say: 1 to 255 times a power of ten.
+    sayable = {value * 10**exponent for value in range(1, 256) for exponent in range(6)}
+    assert shortest in sayable
+    if shorter := max((cycle for cycle in sayable if cycle < shortest), default=0):
         assert not bus_budget(axes, shorter, bit_rate, heartbeat_ms, sdo_frames).is_within_bound
 
 

@@ -9,16 +9,17 @@ from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.reactions import CoupledStop
 from gateway.running.preparation import axis_units, compile_config
+from mechanism.slave_law import SlaveLaw
 
 CONFIG = load_config("paper")
-PROFILE = compile_config(CONFIG).profile
+LAW = SlaveLaw(compile_config(CONFIG).profile)
 
 
 @pytest.mark.parametrize("apart", [1, 2, 6, 20, 50])
 def test_rare_sights_of_the_master_do_not_make_its_velocity_swing_up(apart):
     """It coasts at 1 rev/s, seen every so many cycles: what the observer takes for its speed stays near that."""
     channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(PROFILE, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
     master = channels[0]
     stop.begin(0.0, math.tau, [0, 0])
     for cycle in range(1, 2001):

@@ -100,9 +100,10 @@ def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
 
 def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_its_axis():
     guard, axes, watch = make()
-    # From cycle 3 on the actual stays at 9; the demand goes 3 counts a cycle: 12 counts, more than 11, at cycle 7.
+    # From cycle 3 on the actual stays at 9; the demand goes 3 counts a cycle: 12 counts, more than 11, at cycle 7,
+    # and that is held for three cycles.
     track = [(3 * n, min(3 * n, 9)) for n in range(20)]
-    assert run(watch, axes, guard, track) == 7
+    assert run(watch, axes, guard, track) == 9
     assert guard.tripped[0].condition is Condition.FROZEN_ACTUAL
     assert guard.reaction is Reaction.DISABLE
     assert guard.disabled == 0b10

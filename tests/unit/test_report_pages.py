@@ -83,6 +83,7 @@ def test_the_report_is_a_page_of_its_own_with_figures_and_json(tmp_path: Path) -
         assert target in page.ids
 
 
+@pytest.mark.slow
 def test_the_same_recording_gives_the_same_report(tmp_path: Path) -> None:
     source = record(tmp_path / "a.mcap", steady_run())
     pages = [write_report(source, tmp_path / name)[0].read_bytes() for name in ("one", "two")]
