@@ -1,7 +1,9 @@
 """What the machine is to do so that its parameters show: the cam at several speeds, with ramps as steep as is allowed.
 
 Gravity and dry friction are the same at every speed, viscous friction grows with it, inertia with its square and with
-the ramps: only together can they be told apart. Every run is checked as any other before anything moves.
+the ramps: only together can they be told apart. The model's own torque offsets are left out: an axis that they hold
+within a count shows the same part of its controller's ripple at every SYNC, which would be taken for friction. Every
+run is checked as any other before anything moves.
 """
 
 from typing import Final
@@ -29,6 +31,8 @@ def _steepest(config: GatewayConfig, share: float, machine_cycles: int) -> Prepa
     for factor in RAMP_FACTORS:
         document = config.model_dump(mode="json")
         motion = document["motion"]
+        document["feed_forward"]["enabled"] = False
+        document["learning"]["enabled"] = False
         motion["speed_rpm"] *= share
         motion["machine_cycles"] = machine_cycles
         motion["ramp_acceleration_rad_per_s2"] *= factor

@@ -114,6 +114,8 @@ def test_the_excitation_keeps_speed_and_limits():
     runs = excitation_runs(PAPER, 1)
     assert [run.config.motion.speed_rpm for run in runs] == [30.0, 45.0, 60.0]
     assert all(run.violations == () for run in runs)
+    assert PAPER.feed_forward.enabled
+    assert not any(run.config.feed_forward.enabled or run.config.learning.enabled for run in runs)
     assert all(run.config.motion.ramp_acceleration_rad_per_s2 >= 6.0 for run in runs)
 
 
@@ -129,6 +131,9 @@ def test_identify_and_compare_from_the_command_line(tmp_path):
     model, picture = tmp_path / "model.yaml", tmp_path / "fit.png"
     found = json.loads(cli("identify", "paper", "--virtual-time", "-o", model, "--plot", picture, "--json"))
     assert found["parameters"]["coulomb.slave"]["value"] == pytest.approx(0.05, rel=0.1)
+    for name, true in (("coulomb.master", 0.04), ("viscous.master", 0.005), ("viscous.slave", 0.005)):
+        low, high = found["parameters"][name]["interval_95"]
+        assert low <= true <= high, name
     assert yaml.safe_load(model.read_text())["feed_forward"]["axes"]["servo"]["coulomb_Nm"] == pytest.approx(
         0.05, rel=0.1
     )
