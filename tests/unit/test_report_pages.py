@@ -101,7 +101,17 @@ def test_figures_of_the_page_take_their_colours_from_it() -> None:
         assert "var(--ink)" in svg
 
 
-@pytest.mark.parametrize("kind", ["one record", "never moved", "all missed", "many cycles", "no mechanism", "stopped"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "one record",
+        "stopped",
+        *(
+            pytest.param(kind, marks=pytest.mark.slow)
+            for kind in ("never moved", "all missed", "many cycles", "no mechanism")
+        ),
+    ],
+)
 def test_poor_runs_have_a_report_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     monkeypatch.setattr("gateway.reporting.report.to_png", lambda _plot, _data: b"")  # drawn as SVG by the same code
     samples = steady_run(600, records_a_turn=20 if kind == "many cycles" else 1000)

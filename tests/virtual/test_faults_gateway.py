@@ -132,6 +132,7 @@ def test_the_same_faults_and_seed_give_the_same_frames_at_the_same_nanoseconds()
     assert first.frames != other.frames
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "quirk",
     [
