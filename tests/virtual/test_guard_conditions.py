@@ -14,7 +14,8 @@ from sim_drive.injection.faults import Direction, Fault, FaultKind
 CONTROLLED_BOUND_RAD = math.radians(6.0)
 """How far link s may get from the cam in a controlled stop; in an undisturbed run it is 5.3 deg (60 counts)."""
 QUICK_BOUND_RAD = math.radians(20.0)
-LEAST_SINE = 0.75
+LEAST_SINE = 0.7
+"""A resolver that jumps by 13 deg has its drive carry the link there before anybody can know."""
 PHASE_AT_S = {
     "commissioning": 0.03,
     "enabling": 0.075,
