@@ -46,10 +46,8 @@ def test_docs_show_what_the_command_prints(reproduced):
     for ours, theirs in zip(told, shown, strict=True):
         assert [NUMBER.sub("#", cell) for cell in ours] == [NUMBER.sub("#", cell) for cell in theirs]
         for cell, written in zip(ours, theirs, strict=True):
-            # When servo ticks fall between two SYNCs moves an extreme along its plateau, and peaks of torque by a count.
-            coarse = {"counts": 1.01, "deg": 6.0, "N m": 0.2}.get(
-                ours[1], 1.01 if ours[1].startswith("counts") else 0.21
-            )
+            # Where servo ticks fall between two SYNCs moves an extreme along its plateau, and a peak of torque.
+            coarse = {"counts": 1.01, "counts/s": 1.01, "deg": 6.0}.get(ours[1], 0.21)
             assert numbers(cell) == pytest.approx(numbers(written), rel=0.02, abs=coarse)
 
 
