@@ -11,7 +11,7 @@ from config.bus_budget import MAX_BUS_LOAD, BusBudget, bus_budget, deadline_with
 from config.emulation_section import EmulatedDriveSection
 from config.guard_section import GuardSection
 from config.model import AxisName, Model, Point, Positive
-from config.torque_sections import FeedForwardSection, LearningSection
+from config.torque_sections import FeedForwardSection, LearningSection, PositionLoopSection
 from drivers.nmt import MAX_NODE_ID
 
 SERVO_RATE_HZ: Final = 1024
@@ -161,6 +161,8 @@ class AxisSection(Model):
     """CiA 402 homing on the current position; null leaves the drive's zero as it is."""
     rated_torque_Nm: Positive
     limits: LimitsSection
+    position_loop: PositionLoopSection | None = None
+    """Null: the drive closes the loop (csp); else the gateway does (cst)."""
     emulation: EmulatedDriveSection
 
 

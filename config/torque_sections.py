@@ -78,3 +78,13 @@ class LearningSection(Model):
     bins: Annotated[int, Field(ge=16, le=4096)] = 256
     """Places of a revolution for which a torque is kept."""
     axes: dict[AxisName, LearnedAxisSection] = Field(default_factory=dict[AxisName, LearnedAxisSection])
+
+
+class PositionLoopSection(Model):
+    """The position loop of an axis that the gateway closes itself: its drive runs in cyclic synchronous torque."""
+
+    proportional_Nm_per_rad: Positive
+    integrating_Nm_per_rad_s: NotNegative = 0.0
+    derivative_Nms_per_rad: NotNegative = 0.0
+    torque_limit_Nm: Positive
+    """Bound of the torque that is sent, feed-forward included."""

@@ -28,6 +28,7 @@ class ModeOfOperation(IntEnum):
     NONE = 0
     HOMING = 6
     CYCLIC_SYNCHRONOUS_POSITION = 8
+    CYCLIC_SYNCHRONOUS_TORQUE = 10
 
 
 class Controlword(IntFlag):

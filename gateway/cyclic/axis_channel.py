@@ -2,6 +2,7 @@
 
 from drivers.cia402 import COMMAND_DISABLE_VOLTAGE
 from drivers.pdo import RPDO_BASE, TPDO_BASE
+from gateway.cyclic.position_loop import PositionLoop
 from gateway.units import AxisUnits
 
 
@@ -14,6 +15,7 @@ class AxisChannel:
         "following_error_limit",
         "name",
         "node_id",
+        "position_loop",
         "rpdo_cob_id",
         "silent_cycles",
         "statusword",
@@ -24,11 +26,20 @@ class AxisChannel:
         "units",
     )
 
-    def __init__(self, name: str, node_id: int, units: AxisUnits, following_error_limit: int) -> None:
+    def __init__(
+        self,
+        name: str,
+        node_id: int,
+        units: AxisUnits,
+        following_error_limit: int,
+        position_loop: PositionLoop | None = None,
+    ) -> None:
+        """``position_loop``: the gateway closes it and sends torques; None leaves it to the drive."""
         self.name = name
         self.node_id = node_id
         self.units = units
         self.following_error_limit = following_error_limit
+        self.position_loop = position_loop
         self.rpdo_cob_id = RPDO_BASE[0] + node_id
         self.tpdo_cob_id = TPDO_BASE[0] + node_id
         self.controlword = COMMAND_DISABLE_VOLTAGE

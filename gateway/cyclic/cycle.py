@@ -21,6 +21,7 @@ from drivers.pdo import PdoLayout
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.demand import Demand
 from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.position_loop import PositionLoop
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
 from gateway.record.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
@@ -461,9 +462,21 @@ class CyclicLoop:
         outbox = self.outbox
         for number, axis in enumerate(self.axes):
             axis.target = targets[number]
-            axis.torque_offset = torque_offsets[number]
+            torque = torque_offsets[number]
+            if axis.position_loop is not None:
+                torque = self._close_position_loop(number, axis, axis.position_loop, torque)
+            axis.torque_offset = torque
             payload = _pack_rpdo(axis.controlword, axis.target, axis.torque_offset)
             outbox.append(Frame(axis.rpdo_cob_id, payload))
+
+    def _close_position_loop(self, number: int, axis: AxisChannel, loop: PositionLoop, offset: int) -> int:
+        """Torque for an axis in cyclic synchronous torque: target and actual value are those of this SYNC."""
+        if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
+            return loop.reset()
+        if self._awaited >> number & 1:
+            return loop.hold()
+        _, _, velocities, targets, _, _ = self._in_force
+        return loop.update(targets[number], axis.actual, velocities[number], offset)
 
     def _check(self, now_ns: int) -> None:
         if self.phase is Phase.DISABLED:

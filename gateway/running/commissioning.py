@@ -40,6 +40,8 @@ RPDO_ENTRIES: Final = (
     MappingEntry(objects.TARGET_POSITION, 0, 32),
     MappingEntry(objects.TORQUE_OFFSET, 0, 16),
 )
+TORQUE_RPDO_ENTRIES: Final = (*RPDO_ENTRIES[:2], MappingEntry(objects.TARGET_TORQUE, 0, 16))
+"""Where the gateway closes the position loop; the target position is sent for the record."""
 TPDO_ENTRIES: Final = (
     MappingEntry(objects.STATUSWORD, 0, 16),
     MappingEntry(objects.POSITION_ACTUAL_VALUE, 0, 32),
@@ -70,6 +72,8 @@ class NodeSettings:
     """Counts/s^2, 6085h; None: as the drive has it."""
     torque_limit_permille: int | None = None
     """Where the gateway's guard trips; a drive that gives no more than that (6072h) is refused. None: not checked."""
+    is_torque_controlled: bool = False
+    """The gateway closes the position loop: cyclic synchronous torque."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,7 +223,7 @@ def map_pdos(master: Master, node: NodeSettings) -> Procedure[None]:
         objects.RPDO_COMMUNICATION,
         objects.RPDO_MAPPING,
         RPDO_BASE[0] + node_id,
-        RPDO_ENTRIES,
+        TORQUE_RPDO_ENTRIES if node.is_torque_controlled else RPDO_ENTRIES,
     )
     yield from map_pdo(
         master,

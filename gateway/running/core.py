@@ -64,6 +64,12 @@ class OperatorStopError(GatewayError):
     """Somebody asked for a stop before the machine was in motion."""
 
 
+def _cyclic_mode(node: NodeSettings) -> ModeOfOperation:
+    if node.is_torque_controlled:
+        return ModeOfOperation.CYCLIC_SYNCHRONOUS_TORQUE
+    return ModeOfOperation.CYCLIC_SYNCHRONOUS_POSITION
+
+
 class GatewayCore:
     """One session with the machine, from boot-up to disabled drives."""
 
@@ -347,8 +353,7 @@ class GatewayCore:
 
     def _enable_all(self) -> Procedure[None]:
         self._step("enabling the axes")
-        mode = ModeOfOperation.CYCLIC_SYNCHRONOUS_POSITION
-        yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), mode))
+        yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), _cyclic_mode(node)))
         master, slave = (axis.channel.actual for axis in self._axes)
         targets = self._demand.align(self._plan.at(0.0)[0], (master, slave))
         problems: list[str] = []

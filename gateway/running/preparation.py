@@ -15,6 +15,7 @@ from gateway.cyclic.cycle import AxisChannel, CyclicLoop, SampleSink
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.operation import Operation
+from gateway.cyclic.position_loop import PositionLoop
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.torque_offsets import build_feed_forward, build_torque_offsets, torque_violations
 from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
@@ -241,6 +242,21 @@ def _quick_stop_deceleration(axis: AxisSection) -> int | None:
     return None if deceleration is None else round(deceleration * axis.counts_per_revolution / math.tau)
 
 
+def position_loop(axis: AxisSection, cycle_s: float) -> PositionLoop | None:
+    """The position loop that the gateway closes itself; None where the drive does."""
+    section = axis.position_loop
+    if section is None:
+        return None
+    return PositionLoop(
+        axis_units(axis),
+        cycle_s,
+        section.proportional_Nm_per_rad,
+        section.integrating_Nm_per_rad_s,
+        section.derivative_Nms_per_rad,
+        section.torque_limit_Nm,
+    )
+
+
 def node_settings(config: GatewayConfig) -> list[NodeSettings]:
     """What commissioning must know of each drive, master first."""
     return [
@@ -258,6 +274,7 @@ def node_settings(config: GatewayConfig) -> list[NodeSettings]:
             counts_per_revolution=axis.counts_per_revolution,
             quick_stop_deceleration=_quick_stop_deceleration(axis),
             torque_limit_permille=config.guard.torque.limit_permille,
+            is_torque_controlled=axis.position_loop is not None,
         )
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
     ]
@@ -304,7 +321,13 @@ def build_core(
     ``tpdo_deadline_us``: how long after SYNC the TPDOs are waited for; None is what the bus budget leaves.
     """
     channels = [
-        AxisChannel(name, axis.node_id, axis_units(axis), axis.limits.gateway_error_counts)
+        AxisChannel(
+            name,
+            axis.node_id,
+            axis_units(axis),
+            axis.limits.gateway_error_counts,
+            position_loop(axis, config.cycle_s),
+        )
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
     ]
     setups = [
