@@ -133,6 +133,10 @@ class Guard:
         """Which condition an EMCY with this error code is."""
         return Condition.EMERGENCY_WARNING if code in self._warning_codes else Condition.EMERGENCY
 
+    def is_holding(self, condition: Condition, axis: int) -> bool:
+        """Whether the condition held when it was looked at last, for however few cycles."""
+        return self._counts[condition][axis] > 0
+
     def clear(self, condition: Condition, axis: int) -> None:
         """The condition does not hold in this cycle."""
         counts = self._counts[condition]

@@ -156,7 +156,8 @@ class CycleWatch:
             guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.VELOCITY, number)
-        if moved:
+        if moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
+            # A drive that has had no new target stands, whatever its resolver shows.
             self._travels[number] = 0
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)

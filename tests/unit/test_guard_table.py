@@ -109,6 +109,19 @@ def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_
     assert guard.disabled == 0b10
 
 
+def test_an_axis_whose_demands_came_too_late_is_not_taken_for_frozen():
+    guard, _, watch = make()
+    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 0)
+    for cycle in range(1, 20):
+        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
+        watch.check(0, [0, 3 * cycle], 0.0, Phase.CAM, True, cycle)
+    assert all(trip.condition is not Condition.FROZEN_ACTUAL for trip in guard.tripped)
+    guard.clear(Condition.MISSED_DEADLINE, 0)
+    for cycle in range(20, 30):
+        watch.check(0, [0, 3 * cycle], 0.0, Phase.CAM, True, cycle)
+    assert guard.tripped[-1].condition is Condition.FROZEN_ACTUAL
+
+
 def test_an_axis_that_stands_as_it_should_is_not_frozen_nor_one_that_flickers():
     guard, axes, watch = make()
     assert run(watch, axes, guard, [(100, 100)] * 1000) is None

@@ -18,7 +18,16 @@ pytestmark = [
 ]
 
 PATIENCE_S = 240.0
-TOO_SLOW = {"missed_tpdo", "missed_deadline", "emergency", "heartbeat_lost"}
+TOO_SLOW = {
+    "missed_tpdo",
+    "missed_deadline",
+    "axis_silent",
+    "frozen_actual",
+    "sync_lost",
+    "bus_off",
+    "emergency",
+    "heartbeat_lost",
+}
 """Reasons to stop that a computer gives which cannot keep 1 kHz with all the processes on its one processor."""
 
 
@@ -44,7 +53,7 @@ def test_the_demo_runs_on_vcan0(drive_gateway: Callable[..., "subprocess.Popen[s
     assert process.returncode == 1, complaints
     assert answer["stopped_by"] in TOO_SLOW, complaints
     assert f"the run did not complete, it was stopped by: {answer['stopped_by']}" in complaints
-    assert answer["cycle"]["missed_tpdo"] + answer["cycle"]["missed_rpdo_deadline"] + answer["cycle"]["overruns"] > 0
+    assert sum(answer["cycle"][what] for what in ("missed_tpdo", "missed_rpdo_deadline", "overruns", "sync_lost")) > 0
     assert "Traceback" not in complaints
 
 
