@@ -10,7 +10,6 @@ from config.emulation_section import GainsSection
 from config.loading import SHIPPED, parse_config, parse_model, read_text
 from config.model import Model
 from config.schema import GatewayConfig
-from config.torque_sections import FeedForwardSection, LearningSection
 
 LOOSE_FROZEN_DEG: Final = 3.0
 """How far the demand of an axis with such gains may go while the axis stands."""
@@ -51,8 +50,6 @@ def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
     # A loose axis stands in dry friction at its turning points while the demand goes on by more than a tight one would.
     frozen = config.guard.frozen_actual
     wide = frozen.model_copy(update={"limit_deg": max(frozen.limit_deg, LOOSE_FROZEN_DEG)})
-    unaided = {"feed_forward": FeedForwardSection(), "learning": LearningSection()}
-    changed = config.model_copy(
-        update={"axes": axes, "guard": config.guard.model_copy(update={"frozen_actual": wide}), **unaided}
-    )
+    guard = config.guard.model_copy(update={"frozen_actual": wide})
+    changed = config.unaided.model_copy(update={"axes": axes, "guard": guard})
     return parse_config(yaml.safe_dump(changed.model_dump(mode="json"), sort_keys=False), config.path)

@@ -290,6 +290,11 @@ class GatewayConfig(Model):
         """Speed of the CV axis."""
         return self.motion.speed_rpm * 2.0 * math.pi / 60.0
 
+    @property
+    def unaided(self) -> Self:
+        """The same machine without feed-forward and learning: the drives' controllers alone."""
+        return self.model_copy(update={"feed_forward": FeedForwardSection(), "learning": LearningSection()})
+
     def relative(self, name: str) -> Path:
         """A file that the configuration names: beside it, or the shipped one of that name."""
         beside = self._path.parent / name

@@ -29,10 +29,8 @@ def excitation_runs(config: GatewayConfig, machine_cycles: int) -> list[Prepared
 def _steepest(config: GatewayConfig, share: float, machine_cycles: int) -> PreparedRun:
     refused: Exception | None = None
     for factor in RAMP_FACTORS:
-        document = config.model_dump(mode="json")
+        document = config.unaided.model_dump(mode="json")
         motion = document["motion"]
-        document["feed_forward"]["enabled"] = False
-        document["learning"]["enabled"] = False
         motion["speed_rpm"] *= share
         motion["machine_cycles"] = machine_cycles
         motion["ramp_acceleration_rad_per_s2"] *= factor

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, Final, Protocol, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,22 +108,6 @@ class RunEvent:
     """Something that happened, as the loop told it: ``data`` is JSON-able and has at least ``at_ns`` and ``kind``."""
 
     data: Mapping[str, Any]
-
-
-class Sink(Protocol):
-    """Where the cyclic loop puts what it sees: the ring in real time, the recording itself in virtual time."""
-
-    def append(self, *values: float) -> None:
-        """Take one sample: the values of ``SampleLayout.pack_into``, in its order."""
-        ...
-
-    def append_frame(self, at_ns: int, cob_id: int, data: bytes, is_remote: bool = False) -> None:
-        """Take one CAN frame that was sent or received at ``at_ns``."""
-        ...
-
-    def append_event(self, at_ns: int, kind: str, text: str, **data: str | int | float | bool | None) -> None:
-        """Take one event. The event that ends a run carries ``stopped_by``."""
-        ...
 
 
 class _Mapping:

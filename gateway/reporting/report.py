@@ -51,6 +51,7 @@ def render_page(recording: Recording, data: RunData, report: RunReport, plots: t
     """The page as HTML."""
     figures = {plot.stem: _figure(plot, data) for plot in plots}
     return PAGE.format(
+        scripts="",
         title=escape(f"{report.constants.config_name}: axis errors"),
         style=STYLE,
         heading=escape(f"{report.constants.config_name}, axis errors"),

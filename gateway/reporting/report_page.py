@@ -52,18 +52,23 @@ footer { margin-top: 2rem; color: var(--muted); font-size: .85rem; }
 @media print { body { background: #fff; } figure, .scroll { break-inside: avoid; } }
 """
 
-PAGE: Final = """<!doctype html>
+PAGE_HEAD: Final = """<!doctype html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'{scripts}">
 <title>{title}</title>
 <style>{style}</style>
 </head>
 <body>
 <main>
-<header><h1>{heading}</h1><p>{subtitle}</p></header>
+"""
+"""Beginning of every page: nothing from elsewhere; ``scripts`` is empty, or the source of a script that may run."""
+
+PAGE: Final = (
+    PAGE_HEAD
+    + """<header><h1>{heading}</h1><p>{subtitle}</p></header>
 <section class="tiles">{tiles}</section>
 <h2>Axes at constant master speed</h2>
 {axes}
@@ -88,3 +93,4 @@ of one sample are differences of positions one cycle apart, so they come in step
 </body>
 </html>
 """
+)

@@ -12,7 +12,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.reporting.report_page import STYLE
+from gateway.reporting.report_page import PAGE_HEAD, STYLE
 from gateway.synthesis.linkage_motion import LinkageMotion
 
 Float = NDArray[np.floating[Any]]
@@ -89,18 +89,9 @@ document.addEventListener("keydown", e => {
 label(); show(); requestAnimationFrame(frame);
 """
 
-_PAGE: Final = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'; script-src '{hash}'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<main>
-<header><h1>{title}</h1><p>{subtitle}</p></header>
+_PAGE: Final = (
+    PAGE_HEAD
+    + """<header><h1>{title}</h1><p>{subtitle}</p></header>
 <div class="controls">
 <button id="play" type="button">Pause</button>
 <input id="slide" type="range" min="0" max="360" step="0.5" value="0" aria-label="theta2 in degrees">
@@ -128,6 +119,7 @@ Link p (CV axis) and link s (servo axis) are coloured as their curves are.</figc
 </body>
 </html>
 """
+)
 
 
 def html_of(motion: LinkageMotion) -> str:
@@ -138,7 +130,7 @@ def html_of(motion: LinkageMotion) -> str:
     bar = motion.five_bar
     lengths = ", ".join(f"{n} {v * 1e3:.1f}" for n, v in (("p", bar.p), ("q", bar.q), ("r", bar.r), ("s", bar.s)))
     return _PAGE.format(
-        hash=f"sha256-{digest}",
+        scripts=f"; script-src 'sha256-{digest}'",
         title=escape(f"{motion.name}, the linkage over its cycle"),
         subtitle=escape(f"{rpm:g} rpm; links {lengths} mm; servo swing {np.degrees(motion.displacement_rad):.2f}°"),
         style=STYLE + _STYLE,

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.reporting.report_page import STYLE
+from gateway.reporting.report_page import PAGE_HEAD, STYLE
 from gateway.reporting.report_text import number
 from gateway.synthesis.linkage_motion import LinkageMotion
 from gateway.synthesis.machine_files import MachineFiles, variables_mm
@@ -30,18 +30,9 @@ _STYLE: Final = """
 .tiles { grid-template-columns: repeat(auto-fit, minmax(170px, 1fr)); }
 .tile strong { font-size: 1.3rem; }
 """
-_PAGE: Final = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'unsafe-inline'">
-<title>{title}</title>
-<style>{style}</style>
-</head>
-<body>
-<main>
-<header><h1>{title}</h1><p>{subtitle}</p></header>
+_PAGE: Final = (
+    PAGE_HEAD
+    + """<header><h1>{title}</h1><p>{subtitle}</p></header>
 <section class="tiles">{tiles}</section>
 {complaints}
 <h2>Mechanism</h2>
@@ -65,6 +56,7 @@ gravity and friction at constant CV speed. The mechanism's file holds all of it.
 </body>
 </html>
 """
+)
 
 
 def write_synthesis_report(
@@ -96,6 +88,7 @@ def render_synthesis_page(data: SynthesisData, machine: MachineFiles) -> str:
     status, settings = data.status, data.status.settings
     notes = "".join(f"<p>{escape(text)}</p>" for text in (*data.problems, *machine.notes))
     return _PAGE.format(
+        scripts="",
         title=escape(f"{machine.config.name}: a mechanism for {Path(data.candidate.task.source or 'a curve').name}"),
         subtitle=escape(
             f"method {settings.method.value}, {settings.starts} start{'s' if settings.starts > 1 else ''} from seed "

@@ -166,13 +166,11 @@ def trial_config(config: GatewayConfig, error_limits: tuple[int, int] | None = N
 
     ``error_limits``: counts of (master, slave); None: a share of the configured ones.
     """
-    document = config.model_dump(mode="json")
+    document = config.unaided.model_dump(mode="json")
     for number, name in enumerate(config.axis_names):
         limits = document["axes"][name]["limits"]
         own = max(1, round(ERROR_LIMIT_SHARE * limits["following_error_counts"]))
         limits["guarded_error_counts"] = own if error_limits is None else error_limits[number]
-    for section in ("feed_forward", "learning"):
-        document[section]["enabled"] = False
     document["guard"]["following_error"].update(reaction=Reaction.CONTROLLED_STOP.value)
     return parse_config(yaml.safe_dump(document, sort_keys=False), config.path)
 
