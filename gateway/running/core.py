@@ -452,7 +452,8 @@ class GatewayCore:
             disabled = yield from self.master.wait_for(is_off, DISABLE_TIMEOUT_S)
             if self._recovery is not None and self._guard.stopped_by not in {None, StopReason.OPERATOR}:
                 self._step("recovering the axes")
-                self._events += yield from self._recovery.run()
+                recovered = yield from self._recovery.run()
+                self._events += recovered
                 disabled = is_off()
             if not disabled and self.failure is None:
                 states = ", ".join(f"{a.node.name} '{state_of(a.channel.statusword).value}'" for a in self._axes)

@@ -7,7 +7,9 @@ from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
 from test_approach_from_anywhere import Again
 
 from drivers.cia402 import State, state_of
+from drivers.master import BootUpReceived
 from gateway.record.sample import Phase
+from gateway.running.core import StepReached
 from gateway.running.recovery import AxisRecovered
 from sim_drive.injection.faults import Fault, FaultKind
 
@@ -51,6 +53,9 @@ def test_a_fault_is_reset_by_one_edge_and_the_run_may_begin_anew_from_there():
     assert [resets_of(frames, node) for node in (CV, SERVO)] == [0, 1]
     assert [restarts_of(frames, node) for node in (CV, SERVO)] == [0, 0]
     assert [state_of(axis.statusword) for axis in run.core.loop.axes] == [State.SWITCH_ON_DISABLED] * 2
+    # What happens while the axes are recovered is told once, and in its order.
+    steps = [event.step for event in run.events if isinstance(event, StepReached)]
+    assert steps[-3:] == ["disabling the axes", "recovering the axes", "done"]
     assert_at_rest(run)
     Again(run).to_end().assert_approached_and_ran_home()
 
@@ -85,6 +90,11 @@ def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, t
     assert outcomes(run)["cv"].text == "ready for a new run"
     assert [restarts_of(frames, node) for node in (CV, SERVO)] == [0, 1]
     assert run.core.failure is None
+    told = [
+        event for event in run.events if isinstance(event, (BootUpReceived, AxisRecovered)) and event.at_ns > AT_S * 1e9
+    ]
+    assert len(told) == len(set(told))
+    assert [type(event) for event in told[-3:]] == [BootUpReceived, AxisRecovered, AxisRecovered]
     assert_at_rest(run)
 
 
