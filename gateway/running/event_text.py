@@ -10,7 +10,7 @@ from drivers.node import Event
 from gateway.cyclic.guard import Condition, GuardTripped
 from gateway.cyclic.operation import OrderAnswered
 from gateway.running.commissioning import BootUpMissing
-from gateway.running.core import StepReached
+from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
 
 _UNITS: Final = {

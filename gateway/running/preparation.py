@@ -22,7 +22,8 @@ from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
 from gateway.errors import GatewayError
 from gateway.learning.law import Learning, build_learning
 from gateway.running.commissioning import NetworkSettings, NodeSettings
-from gateway.running.core import START_WINDOW_RAD, GatewayCore
+from gateway.running.core import GatewayCore
+from gateway.running.machine_session import START_WINDOW_RAD, MachineSession
 from gateway.running.powering import AxisSetup
 from gateway.units import AxisUnits
 from mechanism.approach import ApproachField
@@ -363,7 +364,7 @@ def build_core(
         law,
     )
     approach = None if approach_cycles is None else build_approach(config, profile, approach_cycles)
-    core = GatewayCore(
+    session = MachineSession(
         setups,
         network_settings(config),
         build_master(config),
@@ -372,14 +373,13 @@ def build_core(
         run_plan,
         guard,
         is_homing_again,
-        config.bus.sdo_frames_a_cycle,
         approach,
         config.recovery.timeout_s,
     )
-    core.operation = Operation(
+    operation = Operation(
         demand, config.speed_rad_per_s, config.motion.approach_speed_rad_per_s, config.speed_rad_per_s / JOG_SHARE
     )
-    return core
+    return GatewayCore(session, operation, config.bus.sdo_frames_a_cycle)
 
 
 def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: int) -> Approach:

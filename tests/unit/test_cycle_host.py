@@ -49,7 +49,7 @@ class World:
         self.next_sync_ns = None
         self.samples = Samples()
         self.core = build_core(CONFIG, prepared.cam.profile, prepared.plan, self.samples)
-        self.core._session = iter(lambda: 1 << 62, None)  # the session waits for ever: the cycle alone is looked at
+        self.core._procedure = iter(lambda: 1 << 62, None)  # the session waits for ever: the cycle alone is looked at
         self.core.loop.start(0)
         self.echo_cob_id = echo_cob_id
         self.slow_cycles = ()

@@ -48,7 +48,7 @@ def run_emulator(config, from_s, until_s):
     prepared = prepare(config, 1)
     machine = build_machine(config)
     core = build_core(config, prepared.cam.profile, prepared.plan, type("Sink", (), {"append": lambda *_: None})())
-    core._demand = OffsetDemand(core._demand)
+    core.session.demand = OffsetDemand(core.session.demand)
     frames = deque()
     bus = VirtualBus([core, machine], config.bus.bit_rate, trace=lambda at_ns, frame: frames.append((at_ns, frame)))
     bus.run_until(round(from_s * SECOND))

@@ -18,6 +18,7 @@ from gateway.record.sample import Phase, SampleLayout
 from gateway.running.commissioning import map_pdo
 from gateway.running.core import GatewayCore
 from gateway.running.download import download_image
+from gateway.running.machine_session import MachineSession
 from gateway.running.powering import AxisPower, AxisSetup
 from gateway.running.preparation import axis_units, build_master, network_settings, node_settings, prepare
 from gateway.running.procedure_core import ProcedureCore
@@ -82,7 +83,7 @@ def test_an_image_larger_than_the_slot_is_aborted_by_the_drive():
     assert "out of memory" in str(core.failure)
 
 
-class CammingCore(GatewayCore):
+class CammingSession(MachineSession):
     """The gateway's session, but the servo drive runs the cam by itself: mode -2, fed with the CV axis' TPDO."""
 
     def _commission(self):
@@ -120,8 +121,10 @@ def test_the_drive_runs_the_downloaded_cam_against_the_actual_position_of_the_cv
     guard = Guard(PAPER.guard, PAPER.axis_names)
     loop = CyclicLoop(channels, 1_000_000, guard, Sink())
     demand = CamDemand(prepared.cam.profile, (channels[0].units, channels[1].units), 0.001, 6.0, 30.0)
-    core = CammingCore(setups, network_settings(PAPER), build_master(PAPER), loop, demand, prepared.plan, guard)
-    core.power = CammingPower(core.master, loop)
+    master = build_master(PAPER)
+    session = CammingSession(setups, network_settings(PAPER), master, loop, demand, prepared.plan, guard)
+    session.power = CammingPower(master, loop)
+    core = GatewayCore(session)
     # The servo's own target must play no part: it stays where it was.
     step = demand.step
 

@@ -9,7 +9,7 @@ from test_approach_from_anywhere import Again
 from drivers.cia402 import State, state_of
 from drivers.master import BootUpReceived
 from gateway.record.sample import Phase
-from gateway.running.core import StepReached
+from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
 from sim_drive.injection.faults import Fault, FaultKind
 
