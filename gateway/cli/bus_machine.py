@@ -11,7 +11,8 @@ from drivers.real_time import run_node
 from gateway.errors import GatewayError
 from gateway.record.recording import read_recording
 from gateway.running.bus_address import BusAddress
-from gateway.running.preparation import PreparedRun, build_master, node_settings
+from gateway.running.drive_settings import build_master, node_settings
+from gateway.running.preparation import PreparedRun
 from gateway.running.procedure_core import ProcedureCore
 from gateway.running.session import StopSwitch, run_realtime
 from gateway.tuning.controller import GainPair

@@ -184,7 +184,7 @@ def download(
     from drivers.real_time import run_node
     from gateway.running.bus_address import resolve_bus
     from gateway.running.download import DownloadResult, download_image
-    from gateway.running.preparation import axis_units, build_master, node_settings
+    from gateway.running.drive_settings import axis_units, build_master, node_settings
     from gateway.running.procedure_core import ProcedureCore
     from mechanism.cam_file import read_cam_file
     from mechanism.cam_image import encode_cam_image

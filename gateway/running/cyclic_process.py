@@ -31,6 +31,7 @@ from gateway.cyclic.operation import Order
 from gateway.errors import GatewayError
 from gateway.record.order_word import unpack_order
 from gateway.record.ring import RingWriter, RunState, StopRequest
+from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
 from gateway.running.bus_budget import has_wire
 from gateway.running.child_process import end_with
@@ -40,7 +41,7 @@ from gateway.running.cycle_host import CycleHost
 from gateway.running.event_text import describe
 from gateway.running.late_watch import LateWatch
 from gateway.running.learning_store import LearningStore, open_store
-from gateway.running.preparation import build_core, plan
+from gateway.running.preparation import plan
 from mechanism.cam_file import parse_cam_file
 
 LISTENING_S: Final = 0.5

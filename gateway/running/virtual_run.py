@@ -10,9 +10,10 @@ from gateway.errors import GatewayError
 from gateway.learning.law import Learning
 from gateway.record.recording import RecordingMetadata, RecordingSink, RecordingWriter
 from gateway.record.run_constants import RunConstants
+from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
 from gateway.running.event_text import describe
-from gateway.running.preparation import PreparedRun, build_core
+from gateway.running.preparation import PreparedRun
 
 NS_PER_S: Final = 1_000_000_000
 MAX_EXTRA_S: Final = 60.0

@@ -24,7 +24,9 @@ from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
 from gateway.record.sample import Phase, SampleArray, SampleLayout
 from gateway.reporting.analysis import FOLLOWING_PHASES
-from gateway.running.preparation import PreparedRun, build_core, build_master, node_settings
+from gateway.running.assembly import build_core
+from gateway.running.drive_settings import build_master, node_settings
+from gateway.running.preparation import PreparedRun
 from gateway.running.procedure_core import ProcedureCore
 from gateway.tuning.controller import GainPair, Gains
 from gateway.tuning.gain_download import read_gains, write_gains

@@ -18,8 +18,9 @@ from drivers.frame import Frame
 from drivers.python_can_port import PythonCanPort
 from drivers.virtual_time import VirtualBus
 from gateway.record.sample import Phase, SampleLayout
+from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
-from gateway.running.preparation import build_core, prepare
+from gateway.running.preparation import prepare
 from sim_drive.assembly import build_machine
 
 pytestmark = pytest.mark.bench

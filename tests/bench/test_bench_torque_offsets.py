@@ -12,7 +12,8 @@ from torque_study import MIXES, PAPER, FastRun, configured, friction_drifting, s
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.torque_offsets import build_torque_offsets
 from gateway.learning.law import build_learning
-from gateway.running.preparation import axis_units, compile_config
+from gateway.running.drive_settings import axis_units
+from gateway.running.preparation import compile_config
 from mechanism.motion import plan_run
 
 pytestmark = pytest.mark.bench

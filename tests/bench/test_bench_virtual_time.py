@@ -12,8 +12,9 @@ from config.loading import load_config
 from drivers.frame import Frame
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
+from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
-from gateway.running.preparation import build_core, prepare
+from gateway.running.preparation import prepare
 from gateway.running.virtual_run import run_virtual
 from sim_drive.assembly import build_machine
 

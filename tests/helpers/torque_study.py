@@ -15,7 +15,9 @@ from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.torque_offsets import build_torque_offsets
 from gateway.learning.law import LearnedTorque, build_learning
 from gateway.record.sample import Phase, SampleLayout
-from gateway.running.preparation import axis_units, build_core, compile_config, prepare
+from gateway.running.assembly import build_core
+from gateway.running.drive_settings import axis_units
+from gateway.running.preparation import compile_config, prepare
 from mechanism.cam_profile import CamProfile
 from mechanism.motion import MasterPlan, plan_run
 from sim_drive.assembly import build_machine

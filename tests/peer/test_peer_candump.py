@@ -19,7 +19,8 @@ from drivers.virtual_time import VirtualBus
 from gateway.record.recording import read_recording, write_candump_log
 from gateway.record.ring import FRAME_DTYPE, FrameArray
 from gateway.running.download import download_image
-from gateway.running.preparation import build_master, node_settings, prepare
+from gateway.running.drive_settings import build_master, node_settings
+from gateway.running.preparation import prepare
 from gateway.running.procedure_core import ProcedureCore
 from gateway.running.virtual_run import run_virtual
 from mechanism.cam_image import encode_cam_image

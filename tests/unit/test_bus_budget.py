@@ -13,9 +13,10 @@ from drivers.frame import Frame
 from gateway.cli.cam_commands import check
 from gateway.cyclic.sdo_pacing import SdoPacing
 from gateway.errors import GatewayError
+from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
 from gateway.running.bus_budget import budget_json, has_wire, require_budget
-from gateway.running.preparation import build_core, prepare
+from gateway.running.preparation import prepare
 
 CONFIG = load_config("paper")
 

@@ -8,7 +8,8 @@ from config.loading import load_config
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.reactions import CoupledStop
-from gateway.running.preparation import axis_units, compile_config
+from gateway.running.drive_settings import axis_units
+from gateway.running.preparation import compile_config
 from mechanism.slave_law import SlaveLaw
 
 CONFIG = load_config("paper")

@@ -12,10 +12,11 @@ from drivers.real_time import isolated_processors
 from gateway.errors import GatewayError
 from gateway.record.sample import SampleFlag
 from gateway.running import cycle_bus
+from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
 from gateway.running.cycle_bus import open_cycle_bus
 from gateway.running.cycle_host import CycleHost
-from gateway.running.preparation import build_core, prepare
+from gateway.running.preparation import prepare
 
 MS = 1_000_000
 CONFIG = load_config("paper")

@@ -19,7 +19,8 @@ from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.feed_forward import FeedForward
 from gateway.cyclic.torque_offsets import TorqueOffsets, build_feed_forward, build_torque_offsets, torque_lead_s
 from gateway.errors import GatewayError
-from gateway.running.preparation import axis_units, compile_config, plan, prepare
+from gateway.running.drive_settings import axis_units
+from gateway.running.preparation import compile_config, plan, prepare
 from gateway.units import AxisUnits
 from mechanism.cam_profile import CamProfile
 from mechanism.dynamics import Dynamics, DynamicsParameters, LinkParameters

@@ -13,7 +13,8 @@ from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.guard import REASON_OF, Condition, Guard, StopReason
 from gateway.cyclic.watch import AxisLimits, CycleWatch
 from gateway.record.sample import Phase
-from gateway.running.preparation import build_core, compile_config, guard_limits, prepare, slave_law
+from gateway.running.assembly import build_core, guard_limits, slave_law
+from gateway.running.preparation import compile_config, prepare
 from gateway.units import AxisUnits
 from mechanism.deviation import end_effector_miss
 from sim_drive.assembly import build_machine

@@ -15,8 +15,9 @@ from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import GuardTripped, StopReason
 from gateway.record.sample import Phase
+from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
-from gateway.running.preparation import PreparedRun, build_core, prepare
+from gateway.running.preparation import PreparedRun, prepare
 from mechanism.dynamics import inverse_dynamics_along
 from sim_drive.assembly import build_machine
 from sim_drive.injection.faults import Fault, FaultKind

@@ -9,7 +9,7 @@ from guarded_machine import PAPER, SECOND, Guarded, at_theta2
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
 from gateway.record.sample import Phase
-from gateway.running.preparation import build_core
+from gateway.running.assembly import build_core
 
 
 class Again:

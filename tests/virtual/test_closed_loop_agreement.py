@@ -10,7 +10,8 @@ import sim_drive.closed_loop as fast
 from config.loading import load_config, parse_config
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.cycle import RPDO_LAYOUT, TPDO_LAYOUT
-from gateway.running.preparation import build_core, prepare
+from gateway.running.assembly import build_core
+from gateway.running.preparation import prepare
 from sim_drive.assembly import build_machine
 from sim_drive.closed_loop import closed_loop_of
 

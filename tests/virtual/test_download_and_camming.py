@@ -18,9 +18,10 @@ from gateway.record.sample import Phase, SampleLayout
 from gateway.running.commissioning import map_pdo
 from gateway.running.core import GatewayCore
 from gateway.running.download import download_image
+from gateway.running.drive_settings import axis_units, build_master, network_settings, node_settings
 from gateway.running.machine_session import MachineSession
 from gateway.running.powering import AxisPower, AxisSetup
-from gateway.running.preparation import axis_units, build_master, network_settings, node_settings, prepare
+from gateway.running.preparation import prepare
 from gateway.running.procedure_core import ProcedureCore
 from mechanism.cam_image import encode_cam_image
 from sim_drive.assembly import build_machine

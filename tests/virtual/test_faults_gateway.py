@@ -8,7 +8,8 @@ from drivers.frame import Frame
 from drivers.node import Event
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
-from gateway.running.preparation import build_core, prepare
+from gateway.running.assembly import build_core
+from gateway.running.preparation import prepare
 from sim_drive.assembly import build_machine
 from sim_drive.injection.faults import Direction, Fault, FaultKind
 from sim_drive.injection.injector import Injector

@@ -15,7 +15,8 @@ from gateway.cyclic.guard import GuardTripped, StopReason
 from gateway.record.recording import read_recording
 from gateway.record.sample import Phase, SampleLayout
 from gateway.reporting.analysis import analyse
-from gateway.running.preparation import build_core, prepare
+from gateway.running.assembly import build_core
+from gateway.running.preparation import prepare
 from gateway.running.virtual_run import run_virtual
 from sim_drive.assembly import build_machine
 

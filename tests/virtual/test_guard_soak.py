@@ -15,7 +15,7 @@ from guarded_machine import CV, PAPER, SECOND, SERVO, changed, prepared_run
 
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import GuardTripped, StopReason
-from gateway.running.preparation import build_core
+from gateway.running.assembly import build_core
 from gateway.running.recovery import AxisRecovered
 from sim_drive.assembly import build_machine
 from sim_drive.injection.faults import Direction, Fault, FaultKind

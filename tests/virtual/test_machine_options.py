@@ -8,8 +8,9 @@ from config.loading import load_config, parse_config
 from config.schema import GatewayConfig
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
+from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
-from gateway.running.preparation import build_core, prepare
+from gateway.running.preparation import prepare
 from sim_drive.assembly import build_machine
 from sim_drive.machine import EmulatedMachine
 

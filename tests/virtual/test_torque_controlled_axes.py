@@ -7,7 +7,8 @@ from config.loading import load_config, parse_config
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
 from gateway.record.sample import SampleLayout
-from gateway.running.preparation import build_core, prepare
+from gateway.running.assembly import build_core
+from gateway.running.preparation import prepare
 from sim_drive.assembly import build_machine
 from sim_drive.device.cia402 import Mode
 from sim_drive.injection.faults import Fault, FaultKind
