@@ -69,6 +69,11 @@ class SlaveLaw:
         self._park: float = 0.0
 
     @property
+    def cam(self) -> CamProfile:
+        """The cam itself."""
+        return self._cam
+
+    @property
     def is_engaged(self) -> bool:
         """The slave is on its (perhaps shifted) cam, or on its way there."""
         return self._weight_to == 0.0
@@ -86,6 +91,15 @@ class SlaveLaw:
         if self.is_plain:
             return 1.0
         return (1.0 - self._weight_at(theta2)[0]) * max(1.0 - abs(self.shift) / FADE_RAD, 0.0)
+
+    def step(self, theta2: float, period_s: float) -> tuple[float, float, float]:
+        """``advance``, then ``at`` and ``plainness`` there."""
+        if self.is_plain:
+            theta5, slope, _, _ = self._cam.at(theta2)
+            return theta5, slope, 1.0
+        self.advance(theta2, period_s)
+        theta5, slope = self.at(theta2)
+        return theta5, slope, self.plainness(theta2)
 
     def advance(self, theta2: float, period_s: float) -> None:
         """One cycle has passed, the master is at theta2 (rad)."""

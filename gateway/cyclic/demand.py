@@ -161,8 +161,7 @@ class CamDemand:
         self._step += 1
         at_s = self._step * self._period_s
         position, velocity, self._acceleration = plan.at(at_s)
-        self.law.advance(position, self._period_s)
-        theta5, slope = self.law.at(position)
+        theta5, slope, plainness = self.law.step(position, self._period_s)
         self.master_position = position
         self.master_velocity = velocity
         self.velocities = [velocity, slope * velocity]
@@ -179,9 +178,7 @@ class CamDemand:
             for number, away in enumerate(self._approach):
                 self.targets[number] = wrap_counts(self.targets[number] + round(share * away))
         if self._torques is not None:
-            self.torque_offsets = self._torques.at(
-                position, velocity, self._acceleration, (1.0 - share) * self.law.plainness(position)
-            )
+            self.torque_offsets = self._torques.at(position, velocity, self._acceleration, (1.0 - share) * plainness)
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         self.phase = phase
         if self._is_stopping and phase is not Phase.STANDSTILL:

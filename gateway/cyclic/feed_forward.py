@@ -1,6 +1,9 @@
 """Inverse dynamics along a cam: the torque that the model of the machine says a motion will take."""
 
+from collections.abc import Callable
+from functools import partial
 from math import isfinite
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +60,7 @@ class FeedForward:
     No table is laid over theta2: the equations themselves cost a microsecond, and hold at any speed and acceleration.
     """
 
-    __slots__ = ("_constants",)
+    __slots__ = ("torques",)
 
     def __init__(
         self,
@@ -72,7 +75,8 @@ class FeedForward:
         give by themselves in proportion to the demand's velocity, less what they take off in proportion to the actual
         one; it need not be sent.
         """
-        self._constants = (
+        self.torques: Final[Callable[[float, float, float], tuple[float, float]]] = partial(
+            feed_forward,
             parameters.to_array(),
             profile.coefficients,
             profile.net_turns,
@@ -80,9 +84,6 @@ class FeedForward:
             coulomb_velocity,
             *drive_damping,
         )
+        """Torques of master and slave, N m, for a state of the master (rad, rad/s, rad/s^2)."""
         # The first call loads the machine code, which must not happen within a cycle.
         self.torques(0.0, 0.0, 0.0)
-
-    def torques(self, position: float, velocity: float, acceleration: float) -> tuple[float, float]:
-        """Torques of master and slave, N m, for a state of the master (rad, rad/s, rad/s^2)."""
-        return feed_forward(*self._constants, position, velocity, acceleration)

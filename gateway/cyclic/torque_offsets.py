@@ -5,7 +5,7 @@ sends. The torque sent with that target acts at another instant; see ``torque_le
 """
 
 from collections.abc import Sequence
-from math import degrees, tau
+from math import copysign, degrees, tau
 from typing import Final
 
 import numpy as np
@@ -52,9 +52,10 @@ class TorqueOffsets:
     ) -> None:
         """``limits_Nm`` bounds either axis' offset, both ways; ``lead_s``: see ``torque_lead_s``."""
         self._units = units
-        self._limits = tuple(
+        limit2, limit5 = (
             min(limit, INT16_MAX * unit.rated_torque / 1000.0) for unit, limit in zip(units, limits_Nm, strict=True)
         )
+        self._limits = limit2, limit5
         self._rad_per_count = tuple(tau / unit.counts_per_revolution for unit in units)
         self._lead_s = lead_s
         self._feed_forward = feed_forward
@@ -79,8 +80,12 @@ class TorqueOffsets:
             learned = self._learning.torques(position, velocity)
             master += learned[0]
             slave += learned[1]
-        limits = self._limits
-        return max(-limits[0], min(limits[0], master)), max(-limits[1], min(limits[1], slave))
+        limit2, limit5 = self._limits
+        if not -limit2 <= master <= limit2:
+            master = copysign(limit2, master)
+        if not -limit5 <= slave <= limit5:
+            slave = copysign(limit5, slave)
+        return master, slave
 
     def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
         """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""

@@ -46,12 +46,33 @@ class CamWindow:
     """Master, slave."""
     window_rad: float
     end_effector_m: float
+    harmless_counts: tuple[int, int]
+    """Errors of master and slave on the cam itself that cannot exceed either limit: see ``harmless_error`` there."""
+
+
+class _WatchedAxis:
+    """One axis, its limits, and what it was in the cycle before."""
+
+    __slots__ = ("actual", "axis", "error", "frozen_counts", "is_fresh", "target", "torque", "travelled", "velocity")
+
+    def __init__(self, axis: AxisChannel, limits: AxisLimits) -> None:
+        self.axis = axis
+        self.velocity = limits.velocity_counts_per_cycle
+        self.torque = limits.torque_permille
+        self.frozen_counts = limits.frozen_counts
+        self.actual = 0
+        self.target = 0
+        self.error = 0
+        self.travelled = 0
+        """Counts that the demand has gone since the actual value changed last."""
+        self.is_fresh = False
+        """The actual value of the cycle before is known."""
 
 
 class CycleWatch:
     """Compares every cycle with the guard's limits: plain arithmetic, nothing is made unless something is wrong."""
 
-    __slots__ = ("_actuals", "_all_axes", "_axes", "_cam", "_guard", "_is_fresh", "_limits", "_targets", "_travels")
+    __slots__ = ("_all_axes", "_cam", "_guard", "_watched")
 
     def __init__(
         self,
@@ -62,15 +83,10 @@ class CycleWatch:
     ) -> None:
         """``limits``: one an axis, none at all where left out; ``cam``: of a machine of two axes, master first."""
         self._guard = guard
-        self._axes = tuple(axes)
-        self._limits = tuple(limits) or (NO_LIMITS,) * len(self._axes)
+        limits = tuple(limits) or (NO_LIMITS,) * len(axes)
+        self._watched = tuple(_WatchedAxis(axis, limit) for axis, limit in zip(axes, limits, strict=True))
         self._cam = cam
-        self._all_axes = (1 << len(self._axes)) - 1
-        self._actuals = [0] * len(self._axes)
-        self._targets = [0] * len(self._axes)
-        self._travels = [0] * len(self._axes)
-        self._is_fresh = [False] * len(self._axes)
-        """Whether the actual value of the cycle before is known."""
+        self._all_axes = (1 << len(axes)) - 1
         if cam is not None:
             # The first call loads the machine code, which must not happen within a cycle.
             end_effector_miss(cam.geometry, cam.closure, 0.0, 0.0, 0.0, 0.0)
@@ -86,34 +102,42 @@ class CycleWatch:
             self._check_missing(awaited, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.BUS_OFF, 0)
-        for number, axis in enumerate(self._axes):
+        for number, watched in enumerate(self._watched):
             if awaited >> number & 1:
                 continue
-            axis.silent_cycles = 0
+            watched.axis.silent_cycles = 0
             if not guard.is_quiet:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
             if is_enabled:
-                self._check_drive(number, axis, targets[number], now_ns)
-                self._check_motion(number, axis, targets[number], now_ns)
+                self._check_axis(number, watched, targets[number], now_ns)
             else:
-                self._is_fresh[number] = False
+                watched.is_fresh = False
         cam = self._cam
         if cam is not None and is_enabled and not awaited and _RAMP_UP <= phase <= _CONTROLLED_STOP:
-            self._check_cam(cam, targets, master_position, now_ns)
+            master, slave = self._watched
+            master_bound, slave_bound = cam.harmless_counts
+            if (
+                guard.is_quiet
+                and cam.law.is_plain
+                and -master_bound <= master.error <= master_bound
+                and -slave_bound <= slave.error <= slave_bound
+            ):
+                return
+            self._check_cam(cam, master.error, slave.error, master_position, now_ns)
 
     def note_silence(self, awaited: int) -> None:
         """One cycle of which only this counts: whose TPDO is missing (bits as for ``check``)."""
-        for number, axis in enumerate(self._axes):
-            axis.silent_cycles = axis.silent_cycles + 1 if awaited >> number & 1 else 0
+        for number, watched in enumerate(self._watched):
+            watched.axis.silent_cycles = watched.axis.silent_cycles + 1 if awaited >> number & 1 else 0
 
     def _check_missing(self, awaited: int, now_ns: int) -> None:
         guard = self._guard
         is_nobody_here = awaited == self._all_axes
-        for number, axis in enumerate(self._axes):
+        for number, watched in enumerate(self._watched):
             if awaited >> number & 1:
-                axis.silent_cycles += 1
-                self._is_fresh[number] = False
+                watched.axis.silent_cycles += 1
+                watched.is_fresh = False
                 guard.hold_cycles(Condition.MISSED_TPDO, number, now_ns)
                 if not is_nobody_here:
                     guard.hold_cycles(Condition.AXIS_SILENT, number, now_ns)
@@ -122,57 +146,73 @@ class CycleWatch:
         else:
             guard.clear(Condition.BUS_OFF, 0)
 
-    def _check_drive(self, number: int, axis: AxisChannel, target: int, now_ns: int) -> None:
-        guard = self._guard
+    def _check_axis(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
+        axis = watched.axis
+        actual, torque = axis.actual, axis.torque
+        watched.error = error = (target - actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        moved = (actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        limit, bound, velocity = axis.following_error_limit, watched.torque, watched.velocity
+        if not (
+            moved
+            and watched.is_fresh
+            and self._guard.is_quiet
+            and axis.statusword & STATUSWORD_STATE_MASK == STATUSWORD_OPERATION_ENABLED
+            and -limit <= error <= limit
+            and -bound <= torque <= bound
+            and -velocity <= moved <= velocity
+        ):
+            self._check_drive(number, watched, now_ns)
+            self._check_motion(number, watched, target, moved, now_ns)
+        else:
+            watched.travelled = 0
+        watched.actual = actual
+        watched.target = target
+        watched.is_fresh = True
+
+    def _check_drive(self, number: int, watched: _WatchedAxis, now_ns: int) -> None:
+        guard, axis = self._guard, watched.axis
         if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
             guard.hold(Condition.DRIVE_FAULT, number, axis.statusword, 0, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.DRIVE_FAULT, number)
-        error = (target - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
         limit = axis.following_error_limit
-        if not -limit <= error <= limit:
-            guard.hold(Condition.FOLLOWING_ERROR, number, error, limit, now_ns)
+        if not -limit <= watched.error <= limit:
+            guard.hold(Condition.FOLLOWING_ERROR, number, watched.error, limit, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.FOLLOWING_ERROR, number)
-        bound = self._limits[number].torque_permille
+        bound = watched.torque
         if not -bound <= axis.torque <= bound:
             guard.hold(Condition.TORQUE, number, axis.torque, bound, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.TORQUE, number)
 
-    def _check_motion(self, number: int, axis: AxisChannel, target: int, now_ns: int) -> None:
-        guard, limits = self._guard, self._limits[number]
-        actual = axis.actual
-        moved = (actual - self._actuals[number] + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-        travel = (target - self._targets[number] + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-        self._actuals[number] = actual
-        self._targets[number] = target
-        if not self._is_fresh[number]:
-            self._is_fresh[number] = True
-            self._travels[number] = 0
+    def _check_motion(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> None:
+        guard = self._guard
+        if not watched.is_fresh:
+            watched.travelled = 0
             return
-        bound = limits.velocity_counts_per_cycle
+        bound = watched.velocity
         if not -bound <= moved <= bound:
             guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.VELOCITY, number)
         if moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
             # A drive that has had no new target stands, whatever its resolver shows.
-            self._travels[number] = 0
+            watched.travelled = 0
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)
             return
-        travelled = self._travels[number] + (travel if travel > 0 else -travel)
-        self._travels[number] = travelled
-        if travelled > limits.frozen_counts:
-            guard.hold(Condition.FROZEN_ACTUAL, number, travelled, limits.frozen_counts, now_ns)
+        travel = (target - watched.target + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        watched.travelled += travel if travel > 0 else -travel
+        if watched.travelled > watched.frozen_counts:
+            guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
 
-    def _check_cam(self, cam: CamWindow, targets: Sequence[int], master_position: float, now_ns: int) -> None:
-        guard = self._guard
-        (master, slave), (master_scale, slave_scale) = self._axes, cam.rad_per_count
-        error2 = ((targets[0] - master.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE) * master_scale
-        error5 = ((targets[1] - slave.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE) * slave_scale
-        law = cam.law
+    def _check_cam(
+        self, cam: CamWindow, master_error: int, slave_error: int, master_position: float, now_ns: int
+    ) -> None:
+        guard, law = self._guard, cam.law
+        master_scale, slave_scale = cam.rad_per_count
+        error2, error5 = master_error * master_scale, slave_error * slave_scale
         theta5 = law.at(master_position)[0]
         miss = end_effector_miss(cam.geometry, cam.closure, master_position, theta5, error2, error5)
         window = theta5 - error5 - law.at(master_position - error2)[0]

@@ -22,6 +22,7 @@ from gateway.running.powering import AxisSetup
 from gateway.running.preparation import plan
 from mechanism.approach import ApproachField
 from mechanism.cam_profile import CamProfile
+from mechanism.deviation import harmless_error
 from mechanism.motion import MasterPlan
 from mechanism.slave_law import LawLimits, SlaveLaw
 
@@ -62,13 +63,21 @@ def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits]
         for axis in config.ordered_axes
     ]
     master, slave = config.ordered_axes
+    geometry, closure = five_bar(config).to_array(), int(closure_at_home(config, desired_curve(config)))
+    window_rad, end_effector_m = math.radians(guard.cam_window.limit_deg), guard.end_effector_error.limit_mm / 1e3
+    cam = law.cam
+    harmless = harmless_error(geometry, closure, cam.coefficients, cam.net_turns, window_rad, end_effector_m)
     return axes, CamWindow(
-        geometry=five_bar(config).to_array(),
-        closure=int(closure_at_home(config, desired_curve(config))),
+        geometry=geometry,
+        closure=closure,
         law=law,
         rad_per_count=(math.tau / master.counts_per_revolution, math.tau / slave.counts_per_revolution),
-        window_rad=math.radians(guard.cam_window.limit_deg),
-        end_effector_m=guard.end_effector_error.limit_mm / 1e3,
+        window_rad=window_rad,
+        end_effector_m=end_effector_m,
+        harmless_counts=(
+            int(harmless * master.counts_per_revolution / math.tau),
+            int(harmless * slave.counts_per_revolution / math.tau),
+        ),
     )
 
 

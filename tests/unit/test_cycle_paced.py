@@ -257,6 +257,9 @@ def test_whatever_comes_late_what_the_drives_apply_advances_by_one_step_at_most(
     sync_ns = now_ns = 0
     for late_ns, delay_ns, answers in events:
         sync_ns += MS + late_ns
+        if loop.phase is Phase.QUICK_STOP:
+            # An axis has been silent for so long that the demand is left.
+            break
         applied.append(next(demand for at_ns, demand in reversed(rpdos) if at_ns <= sync_ns))
         assert applied[-1] - applied[-2] in (0, 1)
         loop.receive_sync(sync_ns)

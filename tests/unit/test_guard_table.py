@@ -1,7 +1,7 @@
 """The guard's table: what its limits may be, and what every cycle is compared with."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from gateway.record.sample import Phase
 from gateway.running.assembly import build_core, guard_limits, slave_law
 from gateway.running.preparation import compile_config, prepare
 from gateway.units import AxisUnits
-from mechanism.deviation import end_effector_miss
+from mechanism.deviation import end_effector_miss, greatest_deviation, harmless_error
 from sim_drive.assembly import build_machine
 
 PAPER = load_config("paper")
@@ -220,3 +220,53 @@ def test_a_torque_limit_that_the_drive_never_reaches_is_refused_by_commissioning
 class NoSink:
     def append(self, *values):
         pass
+
+
+def test_errors_that_are_passed_over_could_not_have_tripped():
+    window = guard_limits(PAPER, slave_law(PAPER, PROFILE))[1]
+    least = min(window.harmless_counts)
+    # Counts of the resolver: an axis that follows as it should is passed over, one at its limit is not.
+    assert 20 < least < 200
+    random = np.random.default_rng(7)
+    radius = least * window.rad_per_count[0]
+    for theta2, share2, share5 in random.uniform((0.0, -1.0, -1.0), (math.tau, 1.0, 1.0), (2000, 3)).tolist():
+        error2, error5 = share2 * radius, share5 * radius
+        theta5 = PROFILE.at(theta2)[0]
+        assert abs(theta5 - error5 - PROFILE.at(theta2 - error2)[0]) < window.window_rad
+        miss = end_effector_miss(window.geometry, window.closure, theta2, theta5, error2, error5)
+        assert miss < window.end_effector_m
+
+
+def test_a_linkage_that_cannot_be_off_by_a_count_has_no_harmless_error():
+    window = guard_limits(PAPER, slave_law(PAPER, PROFILE))[1]
+    arguments = (window.geometry, window.closure, PROFILE.coefficients, PROFILE.net_turns)
+    small = harmless_error(*arguments, window.window_rad, 1e-4)
+    assert 0.0 < small < math.radians(0.1)
+    assert harmless_error(*arguments, window.window_rad, 0.0) == 0.0
+    apart = np.array([1.0, 1.0, 1.0, 1.0, 5.0, *window.geometry[5:]])
+    assert greatest_deviation(apart, *arguments[1:], 0.01)[1] == math.inf
+
+
+@pytest.mark.parametrize("limit_mm", [50.0, 12.0])
+def test_what_is_passed_over_changes_nothing_that_the_guard_says(limit_mm):
+    random = np.random.default_rng(3)
+    section = {"end_effector_error": PAPER.guard.end_effector_error.model_copy(update={"limit_mm": limit_mm})}
+    config = PAPER.model_copy(update={"guard": PAPER.guard.model_copy(update=section)})
+    limits, window = guard_limits(config, slave_law(config, PROFILE))
+    outcomes = []
+    errors = np.rint(random.laplace(0.0, 60.0, (3000, 2))).astype(int)
+    angles = random.uniform(0.0, math.tau, 3000)
+    for harmless in (window.harmless_counts, (-1, -1)):
+        guard = Guard(config.guard, ("cv", "servo"))
+        axes = [AxisChannel("cv", 1, UNITS, 2000), AxisChannel("servo", 2, UNITS, 2000)]
+        watch = CycleWatch(guard, axes, limits, replace(window, harmless_counts=harmless))
+        counts = []
+        for cycle, (angle, (master, slave)) in enumerate(zip(angles.tolist(), errors.tolist(), strict=True)):
+            for axis in axes:
+                axis.statusword = ENABLED
+            axes[0].actual, axes[1].actual = -master, -slave
+            watch.check(0, [0, 0], angle, Phase.CAM, True, cycle)
+            counts.append([guard.is_holding(one, 0) for one in (Condition.CAM_WINDOW, Condition.END_EFFECTOR_ERROR)])
+        outcomes.append((counts, [(trip.at_ns, trip.condition, trip.value) for trip in guard.tripped]))
+    assert outcomes[0] == outcomes[1]
+    assert sum(row[1] for row in outcomes[0][0]) > 10
