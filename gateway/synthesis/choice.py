@@ -1,6 +1,5 @@
 """Which mechanism of a finished search is taken, and whether it is of use."""
 
-from math import degrees
 from typing import Final
 
 import numpy as np
@@ -11,7 +10,7 @@ from gateway.synthesis.search_slice import Found
 from mechanism.errors import CurveError
 from mechanism.synthesis.candidate import Candidate
 from mechanism.synthesis.search import Method
-from mechanism.synthesis.task import SynthesisTask, Term
+from mechanism.synthesis.task import SynthesisTask
 
 BEST: Final = "best"
 KNEE: Final = "knee"
@@ -68,20 +67,3 @@ def _greatest_miss(candidate: Candidate, error_limit_m: float) -> float:
     except CurveError:
         return float("inf")
     return float((error - (error_limit_m if tolerances is None else tolerances)).max())
-
-
-def missed_tolerance(candidate: Candidate) -> str | None:
-    """A sentence about the point that misses its tolerance most, None where every point keeps its own."""
-    tolerances = candidate.task.tolerances
-    if tolerances is None:
-        return None
-    track = candidate.servo_motion()
-    beyond = track.structural_error - tolerances
-    worst = int(np.argmax(beyond))
-    if not beyond[worst] > 1e-9:
-        return None
-    return (
-        f"no mechanism found within the bounds keeps the tolerances: the term {Term.STRUCTURAL_ERROR.value} cannot be "
-        f"met (point {worst + 1}, theta2 = {degrees(float(track.theta2[worst])):.2f} deg, is missed by "
-        f"{float(track.structural_error[worst]) * 1e3:.3f} mm, tolerance {float(tolerances[worst]) * 1e3:.3f} mm)"
-    )

@@ -9,7 +9,7 @@ from typing import Any
 from config.schema import GatewayConfig
 from gateway.errors import GatewayError
 from gateway.running.session import StopRequest, StopSwitch
-from gateway.synthesis.choice import choose, missed_tolerance
+from gateway.synthesis.choice import choose
 from gateway.synthesis.linkage_motion import LinkageMotion, linkage_motion
 from gateway.synthesis.machine_files import MachineFiles, write_machine
 from gateway.synthesis.report import synthesis_document, torque_figures, write_synthesis_report
@@ -116,16 +116,18 @@ class SynthesisSession:
         front = self.status.front()
         found = choose(self.status, choice, front, self.template.motion.structural_error_limit_mm * 1e-3)
         candidate = found.candidate(self.status.settings.task)
+        missed: str | None = None
         try:
             candidate.require_feasible()
         except SynthesisError as error:
             # A mechanism that misses its curve can be looked at, and is told of by the point that it misses most.
             if error.term != Term.STRUCTURAL_ERROR.value:
                 raise
+            missed = error.reason
         machine = write_machine(self.output, candidate, self.template, self._remark(), self.is_speed_fixed)
         motion = linkage_motion(machine.config, REPORT_SAMPLES)
         outcome = SynthesisOutcome(
-            self.status, candidate, machine, motion, front, report_folder, _problems(candidate, machine, motion)
+            self.status, candidate, machine, motion, front, report_folder, _problems(missed, machine, motion)
         )
         if report_folder is not None:
             data = SynthesisData(motion, self.status, candidate, front, found if front else None, outcome.problems)
@@ -146,8 +148,8 @@ class _AbandonedError(Exception):
     """The user does not want to wait for the slices in hand."""
 
 
-def _problems(candidate: Candidate, machine: MachineFiles, motion: LinkageMotion) -> tuple[str, ...]:
-    missed = missed_tolerance(candidate)
+def _problems(missed: str | None, machine: MachineFiles, motion: LinkageMotion) -> tuple[str, ...]:
+    """``missed``: what tells of a point that is further away than its tolerance; None where there is none."""
     problems = [] if missed is None else [missed]
     for error in machine.violations:
         if isinstance(error, UnreachableError) and error.bound_m > 0.0:
