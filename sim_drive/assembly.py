@@ -23,15 +23,9 @@ from sim_drive.machine import EmulatedMachine, MachineAxis
 from sim_drive.node_row import describe_row
 from sim_drive.physics.compliant import CompliantPlant
 from sim_drive.physics.coupling import Coupling
-from sim_drive.physics.driveline import MotorParameters
-from sim_drive.physics.plant import (
-    AxisDriveline,
-    CoupledPlant,
-    FreeAxisParameters,
-    FreeAxisPlant,
-    Plant,
-    PlantParameters,
-)
+from sim_drive.physics.driveline import AxisDriveline, MotorParameters
+from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
+from sim_drive.physics.plant import CoupledPlant, Plant, PlantParameters
 from sim_drive.physics.servo import DemandResolution
 from sim_drive.settings import DriveIdentity, DriveSettings
 from sim_drive.switches import Switches

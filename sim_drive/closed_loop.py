@@ -23,7 +23,9 @@ from mechanism.errors import ParameterError
 from mechanism.jit import kernel
 from sim_drive.assembly import build_machine
 from sim_drive.machine import TWO_SERVO_PERIODS_NS, MachineAxis
-from sim_drive.physics.plant import SERVO_PERIOD_S, CoupledPlant, advance_five_bar
+from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.physics.five_bar_motion import advance_five_bar
+from sim_drive.physics.plant import CoupledPlant
 from sim_drive.physics.servo import GAIN_SCALE, OUTPUT_MAXIMUM, OUTPUT_MINIMUM, VOLT_PER_UNIT, DemandResolution
 
 Float = NDArray[np.float64]

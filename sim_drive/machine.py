@@ -14,7 +14,8 @@ from typing import Final, NamedTuple
 from drivers.frame import Frame
 from drivers.node import Event
 from sim_drive.machine_seam import AxisTap, DriveAxis, DriveTap, FrameHandler, Latch, MachineDrive
-from sim_drive.physics.plant import SERVO_PERIOD_S, Plant
+from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.physics.plant import Plant
 from sim_drive.physics.servo import SERVO_RATE_HZ, DemandResolution, ServoLoop
 
 TWO_SERVO_PERIODS_NS: Final = 2_000_000_000 // SERVO_RATE_HZ

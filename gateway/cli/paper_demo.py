@@ -73,7 +73,7 @@ def _run_tuning(
     from gateway.running.preparation import prepare
     from mechanism.cam_file import cam_document
     from sim_drive.assembly import build_machine
-    from sim_drive.physics.plant import SERVO_PERIOD_S
+    from sim_drive.physics.driveline import SERVO_PERIOD_S
 
     tuned = with_gain_set(config, gains)
     prepared = prepare(tuned, max(cycles, LEAST_CYCLES))

@@ -19,31 +19,11 @@ from sim_drive.physics.driveline import (
     SERVO_PERIOD_S,
     AxisDriveline,
     AxisEnergy,
-    MotorParameters,
     axis_settings,
     energy_of,
     require_substeps,
 )
 from sim_drive.physics.five_bar_motion import METERED_SIZE, MOTION_SIZE, AxisState, advance_five_bar
-from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
-
-__all__ = [
-    "CV_AXIS",
-    "DEFAULT_SUBSTEPS",
-    "SERVO_AXIS",
-    "SERVO_PERIOD_S",
-    "AxisDriveline",
-    "AxisEnergy",
-    "AxisState",
-    "CoupledPlant",
-    "FiveBarPlant",
-    "FreeAxisParameters",
-    "FreeAxisPlant",
-    "MotorParameters",
-    "Plant",
-    "PlantParameters",
-    "advance_five_bar",
-]
 
 Float = NDArray[np.float64]
 

@@ -12,8 +12,9 @@ from config.loading import load_config
 from mechanism.jit import kernel
 from sim_drive.physics.compliant import CompliantPlant, advance_compliant
 from sim_drive.physics.coupling import Coupling
+from sim_drive.physics.driveline import AxisDriveline
 from sim_drive.physics.five_bar_motion import MOTION_SIZE, advance_five_bar
-from sim_drive.physics.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.physics.plant import CoupledPlant, PlantParameters
 
 PERIODS = 20_000
 OFF = (False, False)

@@ -17,7 +17,7 @@ from sim_drive.assembly import FREE_AXIS, FREE_AXIS_GAINS, SHIPPED_EDS
 from sim_drive.device.drive import Drive
 from sim_drive.logical_axes import eds_of_axes
 from sim_drive.machine import EmulatedMachine, MachineAxis
-from sim_drive.physics.plant import FreeAxisPlant
+from sim_drive.physics.free_axis import FreeAxisPlant
 from sim_drive.settings import DriveSettings
 
 MS = 1_000_000

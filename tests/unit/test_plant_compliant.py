@@ -10,9 +10,9 @@ from driven_machine import OFF, PERIODS_IN_CYCLE, compiled, drive_on_the_cam, fr
 from mechanism.dynamics import DynamicsParameters, inverse_dynamics, mass_matrix_and_bias
 from sim_drive.physics.compliant import CompliantPlant
 from sim_drive.physics.coupling import Coupling, coupling_torques
-from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.physics.driveline import SERVO_PERIOD_S, AxisDriveline
 from sim_drive.physics.five_bar_motion import METERED_SIZE
-from sim_drive.physics.plant import AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.physics.plant import CoupledPlant, PlantParameters
 
 ON = (True, True)
 

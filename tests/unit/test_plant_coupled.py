@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 
 from mechanism.dynamics import STANDARD_GRAVITY, DynamicsParameters, LinkParameters, acceleration
 from mechanism.five_bar import Closure, FiveBar
-from sim_drive.physics.plant import SERVO_PERIOD_S, AxisDriveline, CoupledPlant, PlantParameters
+from sim_drive.physics.driveline import SERVO_PERIOD_S, AxisDriveline
+from sim_drive.physics.plant import CoupledPlant, PlantParameters
 
 OFF = (False, False)
 ON = (True, True)

@@ -8,15 +8,9 @@ import pytest
 from driven_machine import PERIODS_IN_CYCLE, compiled, drive_on_the_cam, frictionless, paper_dynamics
 
 from mechanism.dynamics import DynamicsParameters
-from sim_drive.physics.driveline import MotorParameters
-from sim_drive.physics.plant import (
-    SERVO_PERIOD_S,
-    AxisDriveline,
-    CoupledPlant,
-    FreeAxisParameters,
-    FreeAxisPlant,
-    PlantParameters,
-)
+from sim_drive.physics.driveline import SERVO_PERIOD_S, AxisDriveline, MotorParameters
+from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
+from sim_drive.physics.plant import CoupledPlant, PlantParameters
 
 RIGID = paper_dynamics()
 FRICTIONLESS = frictionless()

@@ -4,7 +4,8 @@ from math import exp
 
 import pytest
 
-from sim_drive.physics.plant import SERVO_PERIOD_S, AxisDriveline, FreeAxisParameters, FreeAxisPlant
+from sim_drive.physics.driveline import SERVO_PERIOD_S, AxisDriveline
+from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
 
 NO_LAG = AxisDriveline(torque_time_constant_s=0.0)
 

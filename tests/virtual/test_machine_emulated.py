@@ -19,13 +19,9 @@ from sim_drive.machine import (
     TickRecord,
     TimeSkipped,
 )
-from sim_drive.physics.plant import (
-    AxisDriveline,
-    CoupledPlant,
-    FreeAxisParameters,
-    FreeAxisPlant,
-    PlantParameters,
-)
+from sim_drive.physics.driveline import AxisDriveline
+from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
+from sim_drive.physics.plant import CoupledPlant, PlantParameters
 
 MS = 1_000_000
 SECOND = 1_000_000_000

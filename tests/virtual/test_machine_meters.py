@@ -7,7 +7,7 @@ from test_machine_emulated import COUNTS_PER_RAD, MS, Bench
 from drivers.frame import Frame
 from sim_drive.assembly import free_machine
 from sim_drive.machine import EmulatedMachine, MachineAxis
-from sim_drive.physics.plant import FreeAxisParameters
+from sim_drive.physics.free_axis import FreeAxisParameters
 
 
 class SdoBench:
