@@ -70,7 +70,7 @@ _NS_PER_S: Final = 1_000_000_000
 
 
 class PlantArguments(NamedTuple):
-    """What `sim_drive.physics.plant.advance_five_bar` wants of a plant, apart from its state."""
+    """What `sim_drive.physics.five_bar_motion.advance_five_bar` wants of a plant, apart from its state."""
 
     dynamics: Float
     settings: Float

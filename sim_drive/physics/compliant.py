@@ -17,21 +17,18 @@ from mechanism.dynamics import energy, linkage_sine
 from mechanism.jit import kernel
 from sim_drive.physics.coupling import MOTOR_INERTIA, STIFFNESS, Coupling, coupling_row, coupling_torques
 from sim_drive.physics.driveline import (
-    DECAY,
-    DECAY_HALF,
     DRY_HEAT,
     ENERGY_COUNT,
-    LIMIT,
     STOP_MAXIMUM,
     STOP_MINIMUM,
-    SUPPLY,
     VISCOUS_HEAT,
     AxisEnergy,
     count_motor,
     dry_friction,
     energy_of,
     smooth_resistance,
-    within_voltage,
+    torques_of_step,
+    within_limit,
 )
 from sim_drive.physics.five_bar_motion import METERED_SIZE, MOTION_SIZE, five_bar_acceleration
 from sim_drive.physics.friction import impulse_bounds, velocities_after_impulse, velocity_after_impulse
@@ -141,20 +138,6 @@ def _motor_impulse(
 
 
 @kernel
-def _torque_on_the_way(
-    settings: Float, axis: int, wanted: float, torque: float, omega: float
-) -> tuple[float, float, float]:
-    """Torque of the amplifier at the start, in the middle and at the end of a step."""
-    command = within_voltage(settings, axis, wanted, omega) if settings[axis, SUPPLY] < inf else wanted
-    start = command if settings[axis, DECAY] == 0.0 else torque
-    return (
-        start,
-        command + (start - command) * settings[axis, DECAY_HALF],
-        command + (start - command) * settings[axis, DECAY],
-    )
-
-
-@kernel
 def _settle(
     state: Float, settings: Float, couplings: Float, axis: int, step_s: float, smooth: Float, motor: float, link: float
 ) -> float:
@@ -203,11 +186,10 @@ def advance_compliant(
     ``scratch`` (3, 14) holds nothing between two calls.
     """
     y, slope, smooth = scratch[0], scratch[1], scratch[2]
-    wanted2 = min(max(command2, -settings[0, LIMIT]), settings[0, LIMIT])
-    wanted5 = min(max(command5, -settings[1, LIMIT]), settings[1, LIMIT])
+    wanted2, wanted5 = within_limit(settings, 0, command2), within_limit(settings, 1, command5)
     for step in range(substeps):
-        start2, middle2, end2 = _torque_on_the_way(settings, 0, wanted2, state[6], state[2])
-        start5, middle5, end5 = _torque_on_the_way(settings, 1, wanted5, state[7], state[3])
+        start2, middle2, end2 = torques_of_step(settings, 0, wanted2, state[6], state[2])
+        start5, middle5, end5 = torques_of_step(settings, 1, wanted5, state[7], state[3])
         is_held2 = _holds(state, settings, couplings, 0, start2, brake2)
         is_held5 = _holds(state, settings, couplings, 1, start5, brake5)
         smooth[:] = 0.0

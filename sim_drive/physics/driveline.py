@@ -205,13 +205,39 @@ def dry_friction(settings: Float, axis: int, omega: float, brake: bool) -> float
 
 
 @kernel
-def within_voltage(settings: Float, axis: int, command: float, omega: float) -> float:
+def within_limit(settings: Float, axis: int, command: float) -> float:
+    """The torque command (N m) that the amplifier's limit allows."""
+    return min(max(command, -settings[axis, LIMIT]), settings[axis, LIMIT])
+
+
+@kernel
+def _within_voltage(settings: Float, axis: int, command: float, omega: float) -> float:
     """The torque command (N m) that the supply voltage allows at a velocity: what the back-EMF leaves, through R."""
-    constant = settings[axis, TORQUE_CONSTANT]
     supply = settings[axis, SUPPLY]
+    if supply == inf:
+        return command
+    constant = settings[axis, TORQUE_CONSTANT]
     back_emf = constant * omega
     scale = constant / settings[axis, RESISTANCE]
     return min(max(command, scale * (-supply - back_emf)), scale * (supply - back_emf))
+
+
+@kernel
+def torques_of_step(
+    settings: Float, axis: int, wanted: float, torque: float, omega: float
+) -> tuple[float, float, float]:
+    """Torque (N m) of the amplifier at the start, in the middle and at the end of a step that begins at ``omega``.
+
+    It lags behind the command ``wanted`` (`within_limit`), as far as the voltage allows that, from ``torque`` on; an
+    amplifier without lag is there at once.
+    """
+    command = _within_voltage(settings, axis, wanted, omega)
+    start = command if settings[axis, DECAY] == 0.0 else torque
+    return (
+        start,
+        command + (start - command) * settings[axis, DECAY_HALF],
+        command + (start - command) * settings[axis, DECAY],
+    )
 
 
 @kernel

@@ -1,6 +1,6 @@
 """The coupled five-bar with both motors rigidly on their links, one servo period at a time: a numba kernel."""
 
-from math import inf, isnan
+from math import isnan
 from typing import Final
 
 import numpy as np
@@ -9,19 +9,16 @@ from numpy.typing import NDArray
 from mechanism.dynamics import linkage_sine, mass_matrix_and_bias
 from mechanism.jit import kernel
 from sim_drive.physics.driveline import (
-    DECAY,
-    DECAY_HALF,
     DRY_HEAT,
     ENERGY_COUNT,
-    LIMIT,
     STOP_MAXIMUM,
     STOP_MINIMUM,
-    SUPPLY,
     VISCOUS_HEAT,
     count_motor,
     dry_friction,
     smooth_resistance,
-    within_voltage,
+    torques_of_step,
+    within_limit,
 )
 from sim_drive.physics.friction import impulse_bounds, velocities_after_impulse
 
@@ -79,12 +76,7 @@ def advance_five_bar(
     Each step: the amplifiers' lag exactly, the smooth motion by a classic Runge-Kutta step, then dry friction, brakes
     and end stops as an impulse (`friction`), the angles following by half a step of the change in velocity.
     """
-    half2, half5 = settings[0, DECAY_HALF], settings[1, DECAY_HALF]
-    full2, full5 = settings[0, DECAY], settings[1, DECAY]
-    command2 = min(max(command2, -settings[0, LIMIT]), settings[0, LIMIT])
-    command5 = min(max(command5, -settings[1, LIMIT]), settings[1, LIMIT])
-    wanted2, wanted5 = command2, command5
-    is_bounded = settings[0, SUPPLY] < inf or settings[1, SUPPLY] < inf
+    wanted2, wanted5 = within_limit(settings, 0, command2), within_limit(settings, 1, command5)
     is_metered = state.shape[0] >= METERED_SIZE
 
     x2, x5, v2, v5 = state[0], state[1], state[2], state[3]
@@ -93,17 +85,8 @@ def advance_five_bar(
     sixth = step_s / 6.0
     torn = 0
     for step in range(substeps):
-        if is_bounded:
-            command2 = within_voltage(settings, 0, wanted2, v2)
-            command5 = within_voltage(settings, 1, wanted5, v5)
-        if full2 == 0.0:
-            torque2 = command2
-        if full5 == 0.0:
-            torque5 = command5
-        middle2 = command2 + (torque2 - command2) * half2
-        middle5 = command5 + (torque5 - command5) * half5
-        end2 = command2 + (torque2 - command2) * full2
-        end5 = command5 + (torque5 - command5) * full5
+        torque2, middle2, end2 = torques_of_step(settings, 0, wanted2, torque2, v2)
+        torque5, middle5, end5 = torques_of_step(settings, 1, wanted5, torque5, v5)
 
         worst = abs(linkage_sine(dynamics, x2, x5, closure))
         f2, f5 = smooth_resistance(settings, 0, v2), smooth_resistance(settings, 1, v5)

@@ -2,25 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import inf, isfinite
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mechanism.jit import kernel
 from sim_drive.physics.driveline import (
-    DECAY,
-    DECAY_HALF,
     DEFAULT_SUBSTEPS,
     DRY_HEAT,
     ENERGY_COUNT,
-    LIMIT,
     LOAD,
     SERVO_PERIOD_S,
     SETTING_COUNT,
     STOP_MAXIMUM,
     STOP_MINIMUM,
-    SUPPLY,
     VISCOUS_HEAT,
     AxisDriveline,
     AxisEnergy,
@@ -30,7 +26,8 @@ from sim_drive.physics.driveline import (
     energy_of,
     require_substeps,
     smooth_resistance,
-    within_voltage,
+    torques_of_step,
+    within_limit,
 )
 from sim_drive.physics.friction import impulse_bounds, velocity_after_impulse
 
@@ -76,18 +73,13 @@ def advance_free_axis(
     Its energies are added to the row ``axis`` of ``energies``, whose columns are those of `driveline`.
     """
     load = settings[axis, LOAD]
-    decay_half, decay = settings[axis, DECAY_HALF], settings[axis, DECAY]
     stop_minimum, stop_maximum = settings[axis, STOP_MINIMUM], settings[axis, STOP_MAXIMUM]
-    wanted = min(max(command, -settings[axis, LIMIT]), settings[axis, LIMIT])
+    wanted = within_limit(settings, axis, command)
     half = 0.5 * step_s
     sixth = step_s / 6.0
     a = 0.0
     for _ in range(substeps):
-        command = within_voltage(settings, axis, wanted, v) if settings[axis, SUPPLY] < inf else wanted
-        if decay == 0.0:
-            torque = command
-        middle = command + (torque - command) * decay_half
-        end = command + (torque - command) * decay
+        torque, middle, end = torques_of_step(settings, axis, wanted, torque, v)
         f = smooth_resistance(settings, axis, v)
         p = (torque - load - f) / inertia
         vb = v + half * p
