@@ -4,14 +4,13 @@ No pacing and no waiting: CPU time of the master's side alone, measured around w
 """
 
 import gc
-import struct
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import can
 import canopen
 import pytest
+from peer_loops import TPDO, mapped_nodes, send_demands
 
 from config.loading import load_config
 from drivers.frame import Frame
@@ -26,7 +25,6 @@ from sim_drive.assembly import build_machine
 pytestmark = pytest.mark.bench
 
 CONFIG = load_config("paper")
-EDS = Path(__file__).parents[2] / "config" / "eds" / "sim_drive.eds"
 NODE_IDS = [axis.node_id for axis in CONFIG.ordered_axes]
 ROUNDS = 3
 """The best of so many is printed: what else the computer does only ever adds."""
@@ -189,45 +187,23 @@ def with_canopen() -> float:
     bus = can.Bus(interface="virtual", channel="canopen")
     network = canopen.Network()
     network.bus = bus  # no notifier: its thread would be measured with it
-    nodes = [map_pdos(network.add_node(node_id, str(EDS))) for node_id in NODE_IDS]
-    tpdo = struct.Struct("<Hih")
+    nodes = mapped_nodes(network, NODE_IDS)
     spent_ns = sent = 0
     for cycle in range(CYCLES):
         begin = time.thread_time_ns()
         network.sync.transmit()
         spent_ns += time.thread_time_ns() - begin
         for node_id in NODE_IDS:
-            drives.answer(0x180 + node_id, tpdo.pack(0x1637, cycle, 0))
+            drives.answer(0x180 + node_id, TPDO.pack(0x1637, cycle, 0))
         begin = time.thread_time_ns()
         for _ in NODE_IDS:
             message = bus.recv(0)
             assert message is not None
             network.notify(message.arbitration_id, message.data, message.timestamp)
-        for node in nodes:
-            actual = node.tpdo[1][1].raw
-            enabled = node.tpdo[1][0].raw & 0x6F == 0x27
-            node.rpdo[1][0].raw = 0x0F if enabled else 0
-            node.rpdo[1][1].raw = actual
-            node.rpdo[1][2].raw = 0
-            node.rpdo[1].transmit()
+        send_demands(nodes)
         spent_ns += time.thread_time_ns() - begin
         sent += drives.heard()
     bus.shutdown()
     drives.bus.shutdown()
     assert sent == CYCLES * 3
     return spent_ns / CYCLES / 1000
-
-
-def map_pdos(node: canopen.RemoteNode) -> canopen.RemoteNode:
-    """The mapping that commissioning gives the drives, without asking one."""
-    for pdo, cob_id, indices in (
-        (node.tpdo[1], 0x180 + node.id, (0x6041, 0x6064, 0x6077)),
-        (node.rpdo[1], 0x200 + node.id, (0x6040, 0x607A, 0x60B2)),
-    ):
-        pdo.clear()
-        for index in indices:
-            pdo.add_variable(index)
-        pdo.cob_id = cob_id
-        pdo.enabled = True
-        pdo.subscribe()
-    return node

@@ -7,15 +7,14 @@ it: cam, guard, session, account and sample. Run with -m bench -s.
 
 import gc
 import socket
-import struct
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import can
 import canopen
 import pytest
-from test_bench_cycle import CONFIG, NODE_IDS, Call, PackingSink, calls, map_pdos, new_core
+from peer_loops import ENABLE_OPERATION, SYNC_COB_ID, TPDO, bare_cycle, canopen_cycle, mapped_nodes
+from test_bench_cycle import CONFIG, NODE_IDS, Call, PackingSink, calls, new_core
 
 from drivers.frame import Frame
 from drivers.socketcan_port import CAN_FRAME, SocketcanPort
@@ -27,11 +26,8 @@ from gateway.units import AxisUnits
 pytestmark = pytest.mark.bench
 __all__ = ["calls"]
 
-EDS = Path(__file__).parents[2] / "config" / "eds" / "sim_drive.eds"
 ROUNDS = 3
 CYCLES = 3000
-SYNC_COB_ID = 0x080
-TPDO = struct.Struct("<Hih")
 
 
 @pytest.fixture(autouse=True)
@@ -167,22 +163,11 @@ def canned(cycles: int) -> list[list[bytes]]:
 
 
 def bare_round() -> Figures:
-    """What cannot be less in Python: sockets and struct, no clock, no check, no record."""
     responder = Responder(canned(CYCLES))
-    near = responder.near
-    send, recv, pack, unpack = near.send, near.recv, CAN_FRAME.pack, CAN_FRAME.unpack
-    sync = CAN_FRAME.pack(SYNC_COB_ID, 0, b"")
-    slots = {0x180 + node_id: number for number, node_id in enumerate(NODE_IDS)}
-    actuals = [0] * len(NODE_IDS)
+    exchange = bare_cycle(responder.near.send, responder.near.recv, NODE_IDS, ENABLE_OPERATION)
 
     def cycle(answer: Callable[[], None], listen: Callable[[], None]) -> None:
-        send(sync)
-        answer()
-        for _ in NODE_IDS:
-            cob_id, _, data = unpack(recv(16))
-            _, actuals[slots[cob_id]], _ = TPDO.unpack(data)
-        for number, node_id in enumerate(NODE_IDS):
-            send(pack(0x200 + node_id, 8, TPDO.pack(0x0F, actuals[number], 0)))
+        exchange(answer)
         listen()
 
     figures = measure(cycle, responder)
@@ -211,22 +196,19 @@ def canopen_round() -> Figures:
     bus = LoopbackBus(responder.near)
     network = canopen.Network()
     network.bus = bus
-    nodes = [map_pdos(network.add_node(node_id, str(EDS))) for node_id in NODE_IDS]
+    nodes = mapped_nodes(network, NODE_IDS)
 
-    def cycle(answer: Callable[[], None], listen: Callable[[], None]) -> None:
-        network.sync.transmit()
+    def wait(answer: Callable[[], None]) -> None:
         answer()
         for _ in NODE_IDS:
             message = bus.recv(0)
             assert message is not None
             network.notify(message.arbitration_id, message.data, message.timestamp)
-        for node in nodes:
-            actual = node.tpdo[1][1].raw
-            enabled = node.tpdo[1][0].raw & 0x6F == 0x27
-            node.rpdo[1][0].raw = 0x0F if enabled else 0
-            node.rpdo[1][1].raw = actual
-            node.rpdo[1][2].raw = 0
-            node.rpdo[1].transmit()
+
+    exchange = canopen_cycle(network, nodes, wait)
+
+    def cycle(answer: Callable[[], None], listen: Callable[[], None]) -> None:
+        exchange(answer)
         listen()
 
     figures = measure(cycle, responder)

@@ -20,8 +20,9 @@ from pathlib import Path
 import can
 import canopen
 import pytest
-from test_bench_cycle import NODE_IDS, Call, calls, map_pdos, new_core
-from test_bench_loop import EDS, TPDO, LoopbackBus, canned
+from peer_loops import ENABLE_OPERATION, bare_cycle, canopen_cycle, mapped_nodes, paced_us, waiting_for
+from test_bench_cycle import NODE_IDS, Call, calls, new_core
+from test_bench_loop import LoopbackBus, canned
 
 from drivers.frame import Frame
 from drivers.real_time import tighten_timers
@@ -169,20 +170,7 @@ def bare_us() -> float:
     with responder(canned(CYCLES), "answers") as near:
         near.settimeout(1.0)
         near.send(CAN_FRAME.pack(0x7FF, 0, b""))
-        sync = CAN_FRAME.pack(0x080, 0, b"")
-        actuals = dict.fromkeys(NODE_IDS, 0)
-        due = time.monotonic()
-        begin = time.process_time_ns()
-        for _ in range(CYCLES):
-            near.send(sync)
-            for _ in NODE_IDS:
-                cob_id, _, data = CAN_FRAME.unpack(near.recv(16))
-                actuals[cob_id - 0x180] = TPDO.unpack(data)[1]
-            for node_id in NODE_IDS:
-                near.send(CAN_FRAME.pack(0x200 + node_id, 8, TPDO.pack(0x0F, actuals[node_id], 0)))
-            due += PERIOD_S
-            time.sleep(max(0.0, due - time.monotonic()))
-        return (time.process_time_ns() - begin) / CYCLES / 1000
+        return paced_us(bare_cycle(near.send, near.recv, NODE_IDS, ENABLE_OPERATION), CYCLES, PERIOD_S)
 
 
 class WaitingBus(LoopbackBus):
@@ -201,23 +189,8 @@ def canopen_us() -> float:
         near.send(CAN_FRAME.pack(0x7FF, 0, b""))
         network = canopen.Network(WaitingBus(near))
         network.connect()
-        nodes = [map_pdos(network.add_node(node_id, str(EDS))) for node_id in NODE_IDS]
-        due = time.monotonic()
-        begin = time.process_time_ns()
-        for _ in range(CYCLES):
-            network.sync.transmit()
-            for node in nodes:
-                node.tpdo[1].wait_for_reception(timeout=PERIOD_S)
-            for node in nodes:
-                actual = node.tpdo[1][1].raw
-                enabled = node.tpdo[1][0].raw & 0x6F == 0x27
-                node.rpdo[1][0].raw = 0x0F if enabled else 0
-                node.rpdo[1][1].raw = actual
-                node.rpdo[1][2].raw = 0
-                node.rpdo[1].transmit()
-            due += PERIOD_S
-            time.sleep(max(0.0, due - time.monotonic()))
-        spent_us = (time.process_time_ns() - begin) / CYCLES / 1000
+        nodes = mapped_nodes(network, NODE_IDS)
+        spent_us = paced_us(canopen_cycle(network, nodes, waiting_for(nodes, PERIOD_S)), CYCLES, PERIOD_S)
         network.disconnect()
     return spent_us
 

@@ -21,6 +21,7 @@ import can
 import canopen
 import pytest
 import yaml
+from peer_loops import bare_cycle, canopen_cycle, mapped_nodes, paced_us, waiting_for
 
 from drivers.broadcast_manager import PeriodicFrame
 from drivers.frame import Frame
@@ -35,14 +36,11 @@ pytestmark = [
 ]
 
 ROOT = Path(__file__).resolve().parent.parent.parent
-EDS = str(ROOT / "config" / "eds" / "sim_drive.eds")
 PATIENCE_S = 1800.0
 CYCLE_US = int(os.environ.get("DRIVE_GATEWAY_BENCH_CYCLE_US", "4000"))
 SPAN_S = float(os.environ.get("DRIVE_GATEWAY_BENCH_S", "4"))
 SYNC_ROUNDS = 3
 NODE_IDS = (1, 2)
-CAN_FRAME = struct.Struct("=IB3x8s")
-TPDO = struct.Struct("<Hih")
 
 C_LOOP = r"""
 #include <linux/can.h>
@@ -111,34 +109,9 @@ def canopen_cycle_us() -> float:
     """The package's own way: a notifier's thread takes what comes, the loop sends SYNC and writes by name."""
     network = canopen.Network()
     network.connect(interface="socketcan", channel="vcan0")
-    nodes = [network.add_node(node_id, EDS) for node_id in NODE_IDS]
-    for node in nodes:
-        for pdo, cob_id, indices in (
-            (node.tpdo[1], 0x180 + node.id, (0x6041, 0x6064, 0x6077)),
-            (node.rpdo[1], 0x200 + node.id, (0x6040, 0x607A, 0x60B2)),
-        ):
-            pdo.clear()
-            for index in indices:
-                pdo.add_variable(index)
-            pdo.cob_id, pdo.enabled = cob_id, True
-            pdo.subscribe()
-    count = round(SPAN_S * 1e6 / CYCLE_US)
-    due = time.monotonic()
-    begin = time.process_time_ns()
-    for _ in range(count):
-        network.sync.transmit()
-        for node in nodes:
-            node.tpdo[1].wait_for_reception(timeout=CYCLE_US * 0.8e-6)
-        for node in nodes:
-            actual = node.tpdo[1][1].raw
-            enabled = node.tpdo[1][0].raw & 0x6F == 0x27
-            node.rpdo[1][0].raw = 0x0F if enabled else 0
-            node.rpdo[1][1].raw = actual
-            node.rpdo[1][2].raw = 0
-            node.rpdo[1].transmit()
-        due += CYCLE_US * 1e-6
-        time.sleep(max(0.0, due - time.monotonic()))
-    spent_us = (time.process_time_ns() - begin) / count / 1000
+    nodes = mapped_nodes(network, NODE_IDS)
+    cycle = canopen_cycle(network, nodes, waiting_for(nodes, CYCLE_US * 0.8e-6))
+    spent_us = paced_us(cycle, round(SPAN_S * 1e6 / CYCLE_US), CYCLE_US * 1e-6)
     network.disconnect()
     return spent_us
 
@@ -151,24 +124,8 @@ def bare_cycle_us() -> float:
         bus.setsockopt(101, 1, exact)
         bus.settimeout(CYCLE_US * 0.8e-6)
         bus.bind(("vcan0",))
-        sync = CAN_FRAME.pack(0x80, 0, b"")
-        actuals = dict.fromkeys(NODE_IDS, 0)
-        count = round(SPAN_S * 1e6 / CYCLE_US)
-        due = time.monotonic()
-        begin = time.process_time_ns()
-        for _ in range(count):
-            bus.send(sync)
-            try:
-                for _ in NODE_IDS:
-                    cob_id, _, data = CAN_FRAME.unpack(bus.recv(16))
-                    actuals[cob_id - 0x180] = TPDO.unpack(data)[1]
-            except TimeoutError:
-                pass
-            for node_id in NODE_IDS:
-                bus.send(CAN_FRAME.pack(0x200 + node_id, 8, TPDO.pack(0, actuals[node_id], 0)))
-            due += CYCLE_US * 1e-6
-            time.sleep(max(0.0, due - time.monotonic()))
-        return (time.process_time_ns() - begin) / count / 1000
+        cycle = bare_cycle(bus.send, bus.recv, NODE_IDS, 0)
+        return paced_us(cycle, round(SPAN_S * 1e6 / CYCLE_US), CYCLE_US * 1e-6)
 
 
 def test_cpu_a_cycle_against_the_same_drives(
