@@ -18,7 +18,8 @@ _AF_CAN: Final = 29
 _CAN_BCM: Final = 2
 _TX_SETUP: Final = 1
 _TX_DELETE: Final = 2
-_SETTIMER_STARTTIMER: Final = 0x3
+_SETTIMER: Final = 0x1
+_STARTTIMER: Final = 0x2
 # opcode, flags, count; ival1 and ival2 as seconds and microseconds; identifier, number of frames
 _HEAD: Final = struct.Struct("@IIIllllII0q")
 
@@ -48,9 +49,17 @@ class PeriodicFrame:
 
     def start(self) -> None:
         """Send the frame now and every period from now on. Raises BusError."""
+        self._set_up(_SETTIMER | _STARTTIMER)
+
+    def retime(self, period_us: int) -> None:
+        """Another period, from the frame after next on; nothing is sent for it. Raises BusError."""
+        self._period_us = period_us
+        self._set_up(_SETTIMER)
+
+    def _set_up(self, flags: int) -> None:
         cob_id, data, _ = self._frame
         period = divmod(self._period_us, 1_000_000)
-        head = _HEAD.pack(_TX_SETUP, _SETTIMER_STARTTIMER, 0, 0, 0, *period, cob_id, 1)
+        head = _HEAD.pack(_TX_SETUP, flags, 0, 0, 0, *period, cob_id, 1)
         self._write(head + CAN_FRAME.pack(cob_id, len(data), data))
 
     def stop(self) -> None:

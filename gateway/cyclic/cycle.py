@@ -116,7 +116,6 @@ class CyclicLoop:
         "_sync_deviation_ns",
         "_sync_due_ns",
         "_sync_ns",
-        "_sync_period_ns",
         "_wake_lateness_ns",
         "_watch",
         "actuals_are_valid",
@@ -131,6 +130,7 @@ class CyclicLoop:
         "period_ns",
         "phase",
         "sync_gap_limit",
+        "sync_period_ns",
         "tpdo_slots",
     )
 
@@ -184,7 +184,8 @@ class CyclicLoop:
         self._sync_due_ns = 0
         self._sync_ns = 0
         self._sync_deviation_ns = 0
-        self._sync_period_ns = 0
+        self.sync_period_ns = 0
+        """From the SYNC before to the last one."""
         self._wake_lateness_ns = 0
         self._awaited = 0
         self._doubtful = 0
@@ -411,7 +412,7 @@ class CyclicLoop:
         """SYNC of the next cycle is on the bus."""
         self._sync_due_ns += self.period_ns
         self._sync_deviation_ns = deviation_ns
-        self._sync_period_ns = sync_ns - self._sync_ns
+        self.sync_period_ns = sync_ns - self._sync_ns
         self._sync_ns = sync_ns
         self._arrival_ns = sync_ns
         self._sent_ns = 0
@@ -528,7 +529,7 @@ class CyclicLoop:
         elif not self.guard.is_quiet:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)
         arrival_ns = self._arrival_ns - self._sync_ns
-        deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self._sync_period_ns, self._cpu_ns
+        deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self.sync_period_ns, self._cpu_ns
         spans_ns = (deviation_ns, period_ns, self._wake_lateness_ns, arrival_ns, lead_ns, cpu_ns)
         if max(spans_ns) > INT32_MAX or min(spans_ns) < -INT32_MAX:
             spans_ns = map(saturate_int32, spans_ns)

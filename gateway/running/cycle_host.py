@@ -16,6 +16,7 @@ from typing import Final, Protocol
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.pdo import RPDO_BASE
+from drivers.period_trim import PeriodTrim
 from drivers.ports import Port
 from drivers.sdo import SDO_RESPONSE_BASE
 from drivers.socketcan_port import SocketcanPort
@@ -43,6 +44,10 @@ class SyncTimer(Protocol):
 
     def stop(self) -> None:
         """Send it no more."""
+        ...
+
+    def retime(self, period_us: int) -> None:
+        """Leave so much time between two of them."""
         ...
 
 
@@ -94,6 +99,7 @@ class CycleHost:
         self._polled_cycle: int = -1
         self.phase_ns = 0
         """When after SYNC the loop wakes; 0 while it is not known."""
+        self._trim = PeriodTrim(core.loop.period_ns // 1000)
         core.loop.is_paced = sync is not None
 
     def run(self) -> None:
@@ -134,6 +140,8 @@ class CycleHost:
             core.receive(frame, self._latest_ns)
             if frame.cob_id == SYNC_COB_ID:
                 core.loop.woke(self._lateness_ns)
+                if self._sync is not None and self._trim.observe(core.loop.sync_period_ns):
+                    self._sync.retime(self._trim.interval_us)
             frames = core.take_frames()
             if frames:
                 self._send(frames)

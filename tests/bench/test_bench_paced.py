@@ -134,6 +134,9 @@ class Starter:
     def stop(self) -> None:
         pass
 
+    def retime(self, period_us: int) -> None:
+        pass
+
 
 def gateway_us(told: list[Call], start: int) -> tuple[float, CycleHost]:
     core = new_core()

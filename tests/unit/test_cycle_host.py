@@ -46,7 +46,9 @@ class World:
         self.sent = []
         self.sleeps = self.waits = self.polls = 0
         self.full_sends = set(full_sends)
-        self.sync_period = None
+        self.cycles = 200
+        self.retimed = []
+        self.timer_lateness_ns = 0
         self.next_sync_ns = None
         self.samples = Samples()
         self.core = build_core(CONFIG, prepared.cam.profile, prepared.plan, self.samples)
@@ -70,6 +72,9 @@ class World:
 
     def stop(self):
         self.next_sync_ns = None
+
+    def retime(self, period_us):
+        self.retimed.append(period_us)
 
     # the bus
     def send(self, frame):
@@ -102,7 +107,8 @@ class World:
         while self.next_sync_ns is not None and self.next_sync_ns <= to_ns:
             self.queue.append((self.next_sync_ns, Frame(SYNC_COB_ID)))
             self.answer(self.next_sync_ns)
-            self.next_sync_ns += MS
+            interval_us = self.retimed[-1] if self.retimed else 1000
+            self.next_sync_ns += interval_us * 1000 + self.timer_lateness_ns
         self.queue.sort(key=lambda entry: entry[0])
         self.now_ns = max(self.now_ns, to_ns)
 
@@ -119,7 +125,7 @@ class World:
 
     def poll(self):
         self.polls += 1
-        if self.core.loop.cycle >= 200:
+        if self.core.loop.cycle >= self.cycles:
             self.core.loop.stop()
             self.core.is_done = True
 
@@ -139,6 +145,16 @@ def test_the_loop_learns_when_to_wake_and_sleeps_as_little_as_once_a_cycle(prepa
     assert world.next_sync_ns is None, "the kernel's SYNC ends with the session"
     # RPDOs leave some 15 us after the phase: 0.68 ms are left.
     assert 650_000 < sorted(world.samples.leads)[100] < 690_000
+
+
+def test_a_timer_that_is_always_late_is_set_to_less(prepared):
+    world = World(prepared, True)
+    world.cycles, world.timer_lateness_ns = 1000, 30_000
+    world.host.run()
+    # The loop's own start counts as a short period in the first window.
+    assert world.retimed in ([970], [971, 970])
+    assert not any(world.samples.flags)
+    assert world.core.loop.sync_period_ns == MS
 
 
 def test_a_full_buffer_is_offered_the_frame_again_and_counted(prepared):

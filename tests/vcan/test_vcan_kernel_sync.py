@@ -53,6 +53,12 @@ def test_the_kernel_sends_every_period_and_stops_when_told() -> None:
         # The kernel sets its timer anew after each frame: a period is never shorter, and a little longer.
         mean_ns = (instants[-1] - instants[0]) / 50
         assert 9.8e6 < mean_ns < 15e6
+        before_ns = time.monotonic_ns()
+        timer.retime(100_000)
+        instants = arrivals(port, 5)
+        # One more may come at the period before; none is sent for the change itself.
+        assert instants[2] - instants[1] > 90e6
+        assert instants[1] - before_ns > 90e6
         timer.stop()
         while port.receive() is not None or port.wait(0.0):
             pass
