@@ -5,68 +5,70 @@ the cam) or back within a window of theta2, so that it is the master's motion th
 between stays on a path that has been looked at.
 """
 
-from math import degrees, inf, tau
+from dataclasses import dataclass
+from math import ceil, degrees, inf, radians, tau
 from typing import Final
-
-import numpy as np
-from numpy.typing import NDArray
 
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import MotionError
-from mechanism.five_bar import Closure, FiveBar
+from mechanism.law_proof import (
+    PASS_POINTS,
+    Excess,
+    LawLimits,
+    LawProof,
+    LawState,
+    Pace,
+    Piece,
+    Strained,
+    Work,
+    finish,
+    smooth,
+)
 
-Float = NDArray[np.float64]
-
-GRID: Final = 360
-"""Angles of the master at which a changed law is looked at."""
 FADE_RAD: Final = 0.1
 """Shift at which a feed-forward that knows the cam alone has faded out."""
-
-
-def smooth(u: float) -> tuple[float, float]:
-    """10 u^3 - 15 u^4 + 6 u^5 and its derivative, for u held within 0 to 1."""
-    if u <= 0.0:
-        return 0.0, 0.0
-    if u >= 1.0:
-        return 1.0, 0.0
-    return u * u * u * (10.0 - u * (15.0 - 6.0 * u)), 30.0 * u * u * (1.0 - u) ** 2
-
-
-class LawLimits:
-    """What a changed law must keep: a five-bar's least sine between q and r, and the slave's limits (rad, s)."""
-
-    __slots__ = ("acceleration", "closure", "five_bar", "minimum_sine", "velocity")
-
-    def __init__(
-        self, five_bar: FiveBar, closure: Closure, minimum_sine: float, velocity: float, acceleration: float
-    ) -> None:
-        self.five_bar = five_bar
-        self.closure = closure
-        self.minimum_sine = minimum_sine
-        self.velocity = velocity
-        self.acceleration = acceleration
+WINDOW_POINTS: Final = 2 * PASS_POINTS
+CAM_POINTS: Final = 64 * PASS_POINTS
+WINDOWS: Final = tuple(radians(window) for window in range(10, 361, 5))
+"""From which the shortest is taken that keeps all limits, where none is asked for."""
+SHIFTS: Final = 5
+"""Shifts, from the old to the new one, of which the path is looked at."""
+SLOWER: Final = (1.0, 2.0, 4.0, 8.0)
+"""How much longer a shift may take than it would by its own speed, so that the slave's limits are kept."""
 
 
 class SlaveLaw:
-    """The law in force, and its changes; each is proved before it is taken."""
+    """The law in force, and its changes; each is proved before it is taken, pass by pass."""
 
-    def __init__(self, cam: CamProfile, limits: LawLimits | None = None) -> None:
-        """``limits`` None: the law is the cam, for good."""
+    def __init__(self, cam: CamProfile, limits: LawLimits | None = None, speed: float = 0.0) -> None:
+        """``limits`` None: the law is the cam, for good. ``speed`` (rad/s): the cam has been proved up to there."""
         self._cam = cam
-        self._limits = limits
+        self._proof = None if limits is None else LawProof(cam, limits)
         self.is_plain: bool = True
         """The law is the cam's own."""
-        self.shift = 0.0
+        self.shift: float = 0.0
         """rad."""
-        self._shift_from = 0.0
-        self._shift_to = 0.0
-        self._shift_s = 0.0
-        self._shift_left_s = 0.0
-        self._weight = 0.0
+        self._shift_from: float = 0.0
+        self._shift_to: float = 0.0
+        self._shift_s: float = 0.0
+        self._shift_left_s: float = 0.0
+        self._weight: float = 0.0
         """w before the window."""
-        self._weight_to = 0.0
+        self._weight_to: float = 0.0
         self._window: tuple[float, float] = (inf, inf)
         self._park: float = 0.0
+        self._base: float = 0.0
+        """Whole revolutions by which a slave that turns on and on has missed the cam's while it was parked, rad."""
+        self._cam_speed: float = speed
+        self._cam_excess = Excess(Strained.MASTER_VELOCITY, "", speed, speed, 0.0)
+        if self._proof is not None:
+            most = self._proof.limits.master_velocity
+            fastest, excess = finish(self._proof.fastest([Piece(LawState(), points=CAM_POINTS)], most, 1.0))
+            self._cam_excess = excess or Excess(
+                Strained.MASTER_VELOCITY, self._proof.limits.axis_names[0], most, most, 0.0
+            )
+            self._cam_speed = max(speed, fastest)
+        self._proved_speed: float = self._cam_speed
 
     @property
     def cam(self) -> CamProfile:
@@ -78,13 +80,19 @@ class SlaveLaw:
         """The slave is on its (perhaps shifted) cam, or on its way there."""
         return self._weight_to == 0.0
 
+    @property
+    def proved_speed(self) -> float:
+        """Speed of the master, rad/s, up to which the law in force keeps all limits for certain."""
+        return self._cam_speed if self.is_plain else self._proved_speed
+
     def at(self, theta2: float) -> tuple[float, float]:
         """theta5 and its derivative with respect to theta2, rad."""
         theta5, slope, _, _ = self._cam.at(theta2 + self.shift)
         if self.is_plain or (self._weight == 0.0 and self._weight_to == 0.0):
-            return theta5, slope
+            return theta5 + self._base, slope
         weight, rate = self._weight_at(theta2)
-        return theta5 + weight * (self._park - theta5), slope * (1.0 - weight) + rate * (self._park - theta5)
+        away = self._park - theta5
+        return theta5 + weight * away + self._base, slope * (1.0 - weight) + rate * away
 
     def plainness(self, theta2: float) -> float:
         """1 on the cam itself, 0 where what is known of the cam does not hold: a factor for feed-forward."""
@@ -96,6 +104,7 @@ class SlaveLaw:
         """``advance``, then ``at`` and ``plainness`` there."""
         if self.is_plain:
             theta5, slope, _, _ = self._cam.at(theta2)
+            theta5 += self._base
             return theta5, slope, 1.0
         self.advance(theta2, period_s)
         theta5, slope = self.at(theta2)
@@ -114,77 +123,128 @@ class SlaveLaw:
             self._window = (inf, inf)
         self.is_plain = self.shift == 0.0 == self._shift_left_s and self._weight == 0.0 == self._weight_to
 
-    def change_shift(self, shift: float, speed: float, shift_speed: float) -> None:
-        """Go over to another shift (rad), no faster than ``shift_speed`` (rad/s), with the master at ``speed`` (rad/s).
+    def prove_speed(self, speed: float) -> Work[None]:
+        """Prove the law in force for a speed of the master (rad/s, either sign) and slower ones.
 
-        Raises MotionError where the shifted path comes too near a singular position or breaks the slave's limits.
+        Raises TooFastError.
         """
-        limits = self._need_limits()
+        if 0.0 <= speed <= self.proved_speed:
+            return
+        proof = self._need_proof()
+        if self.is_plain and speed > 0.0:
+            raise TooFastError(self._cam_speed, self._cam_excess)
+        if self._shift_left_s > 0.0 and speed > 0.0:
+            raise MotionError("the phase is being shifted, the master may go faster when that is done")
+        fastest, excess = yield from proof.fastest(self._pieces(), speed)
+        if excess is not None:
+            raise TooFastError(abs(fastest), excess)
+        self._proved_speed = max(speed, self._proved_speed)
+
+    def change_shift(self, shift: float, speed: float, pace: Pace) -> Work[None]:
+        """Go over to another shift (rad), no faster than the shift of ``pace`` allows, with the master at ``speed``
+        (rad/s) or slower; the shift takes longer where the slave's limits ask for it.
+
+        Raises MotionError where the shifted path comes too near a singular position or breaks a limit.
+        """
+        proof = self._need_proof()
         if self._shift_left_s > 0.0 or self._weight != 0.0 or self._weight_to != 0.0:
             raise MotionError("the phase can be shifted when the slave is on its cam and no other shift is under way")
         away = abs(shift - self.shift)
         if away == 0.0:
             return
-        theta2: Float = np.arange(GRID, dtype=np.float64) * (tau / GRID)
-        shifts = np.linspace(self.shift, shift, 5)[:, np.newaxis]
-        track = self._cam.at_many(theta2[np.newaxis, :] + shifts)
-        self._prove(limits, theta2 + 0.0 * shifts, track[..., 0], f"a shift to {degrees(shift):.1f} deg")
-        duration_s = 1.875 * away / shift_speed
-        fastest = abs(speed) + shift_speed
-        steepest, sharpest = float(np.abs(track[..., 1]).max()), float(np.abs(track[..., 2]).max())
-        _bound("velocity", steepest * fastest, limits.velocity, "rad/s")
-        gain = 5.774 * away / duration_s**2
-        _bound("acceleration", sharpest * fastest**2 + steepest * gain, limits.acceleration, "rad/s^2")
+        # Of 10 u^3 - 15 u^4 + 6 u^5 the greatest first, second and third derivatives are 1.875, 5.774 and 60.
+        shortest_s = max(
+            1.875 * away / pace.shift_speed,
+            (5.774 * away / pace.shift_acceleration) ** 0.5,
+            (60.0 * away / pace.shift_jerk) ** (1.0 / 3.0),
+        )
+        path = [Piece(LawState(self.shift + n / (SHIFTS - 1) * (shift - self.shift))) for n in range(SHIFTS)]
+        excess: Excess | None = None
+        duration_s = shortest_s
+        for slower in SLOWER:
+            duration_s = slower * shortest_s
+            gains = 1.875 * away / duration_s, 5.774 * away / duration_s**2, 60.0 * away / duration_s**3
+            excess = yield from proof.excess(path, Pace(speed, *gains))
+            if excess is None or excess.what is Strained.SINE:
+                break
+        if excess is not None:
+            raise MotionError(f"shifted to {degrees(shift):.4g} deg, {excess}")
+        self._proved_speed = speed
         self._shift_from, self._shift_to = self.shift, shift
         self._shift_s = self._shift_left_s = duration_s
         self.is_plain = False
 
-    def change_engagement(self, is_engaged: bool, at: float, theta2: float, window: float, speed: float) -> None:
-        """Leave the cam, or return to it, beginning when the master (now at theta2) is next at angle ``at``, within
-        ``window`` (all rad), at the master's ``speed`` (rad/s). Parked it is where the cam is at the window's end.
+    def prove_engagement(self, is_engaged: bool, at: float, window: float, speed: float) -> "Work[Engagement]":
+        """Prove that the slave leaves its cam, or returns, from the master's angle ``at`` on and within ``window`` (all
+        rad; 0: the narrowest that fits), with the master at ``speed`` (rad/s) or slower. Parked it is where the
+        cam is at the window's end. `engage` makes it the law.
 
         Raises MotionError where the way or the parked slave comes too near a singular position or breaks a limit.
         """
-        limits = self._need_limits()
+        proof = self._need_proof()
+        self._refuse_engagement(is_engaged)
+        start = at % tau
+        first: Excess | None = None
+        fitting: LawState | None = None
+        for width in (window, *(wider for wider in WINDOWS if wider > window)) if window else WINDOWS:
+            state = self._engagement(is_engaged, start, width)
+            way = Piece(state, start, width, WINDOW_POINTS)
+            excess = yield from proof.excess([way], Pace(speed))
+            if excess is None:
+                excess = yield from proof.excess([Piece(_arrived(state), start)], Pace(speed))
+            if excess is None:
+                fitting = state
+                break
+            first = first or excess
+        if fitting is None or (window and first is not None):
+            width = "any window" if not window else f"{degrees(window):.4g} deg"
+            wider = "no wider window fits" if fitting is None else f"{degrees(fitting.end - start):.0f} deg would fit"
+            raise MotionError(
+                f"{'returning to' if is_engaged else 'leaving'} the cam at {degrees(start):.4g} deg within {width} at "
+                f"{speed * 60.0 / tau:.4g} rpm: {first}" + (f"; {wider}" if window else "")
+            )
+        return Engagement(is_engaged, fitting, speed)
+
+    def engage(self, engagement: "Engagement", theta2: float) -> None:
+        """Make a proved engagement the law, the master being at theta2 (rad, unwrapped): the window begins where the
+        master comes next to the angle that it was proved for. Raises MotionError if the law has changed since.
+        """
+        self._refuse_engagement(engagement.is_engaged)
+        state = engagement.state
+        turns = ceil((theta2 - state.start) / tau)
+        self._window = state.start + turns * tau, state.end + turns * tau
+        park = state.park + turns * self._cam.net_turns * tau
+        if engagement.is_engaged:
+            self._base += self._park - park
+        self._proved_speed = min(engagement.speed, self.proved_speed)
+        self._park = park
+        self._weight_to = state.weight_to
+        self.is_plain = False
+
+    def _refuse_engagement(self, is_engaged: bool) -> None:
         if self.is_engaged is is_engaged:
             raise MotionError(f"the slave is {'on its cam' if is_engaged else 'off its cam'} already")
         if self._window[1] != inf:
             raise MotionError("the slave is still on its way, it can be sent back when it has arrived")
-        start = theta2 + (at - theta2) % tau
-        before = (self._weight, self._weight_to, self._window, self._park, self.is_plain)
-        self._window = start, start + window
+        if self._shift_left_s > 0.0:
+            raise MotionError("the phase is being shifted, the slave can leave its cam when that is done")
+
+    def _engagement(self, is_engaged: bool, start: float, width: float) -> LawState:
+        cam = self._cam.at(start + width + self.shift)[0]
         if not is_engaged:
-            self._park = self._cam.at(start + window + self.shift)[0]
-        self._weight_to = 0.0 if is_engaged else 1.0
-        self.is_plain = False
-        try:
-            self._prove_engagement(limits, start, window, speed)
-        except MotionError:
-            self._weight, self._weight_to, self._window, self._park, self.is_plain = before
-            raise
+            return LawState(self.shift, 0.0, 1.0, start, start + width, cam)
+        # A slave that turns on and on goes on from the revolution in which it is parked.
+        missed = round((cam - self._park) / tau) * tau if self._cam.net_turns else 0.0
+        return LawState(self.shift, 1.0, 0.0, start, start + width, self._park + missed)
 
-    def _prove_engagement(self, limits: LawLimits, start: float, window: float, speed: float) -> None:
-        what = f"leaving the cam at {degrees(start) % 360.0:.1f} deg" if self._weight_to else "returning to the cam"
-        turn: Float = start + np.arange(GRID + 1, dtype=np.float64) * (tau / GRID)
-        u = np.clip((turn - start) / window, 0.0, 1.0)
-        weight = self._weight + (self._weight_to - self._weight) * u**3 * (10.0 - u * (15.0 - 6.0 * u))
-        cam = self._cam.at_many(turn + self.shift)[:, 0]
-        theta5 = cam + weight * (self._park - cam)
-        parked = np.full(GRID + 1, self._park)
-        self._prove(limits, np.stack((turn, turn)), np.stack((theta5, parked)), what)
-        slope = np.gradient(theta5, tau / GRID)
-        _bound("velocity", float(np.abs(slope).max()) * abs(speed), limits.velocity, "rad/s")
-        bend = np.gradient(slope, tau / GRID)
-        _bound("acceleration", float(np.abs(bend).max()) * speed**2, limits.acceleration, "rad/s^2")
-
-    @staticmethod
-    def _prove(limits: LawLimits, theta2: Float, theta5: Float, what: str) -> None:
-        sines = np.abs(limits.five_bar.transmission_sines(theta2, theta5, limits.closure)[..., 0])
-        least = float(sines.min())
-        if not least >= limits.minimum_sine:
-            raise MotionError(
-                f"{what} would bring the linkage to a transmission sine of {least:.3f} (bound {limits.minimum_sine:g})"
-            )
+    def _pieces(self) -> list[Piece]:
+        """The law in force, from here on."""
+        start, end = self._window
+        state = LawState(self.shift, self._weight, self._weight_to, start, end, self._park)
+        before = Piece(LawState(self.shift, self._weight, self._weight, park=self._park))
+        if end == inf:
+            return [before]
+        return [before, Piece(state, start, end - start, WINDOW_POINTS), Piece(_arrived(state), end)]
 
     def _weight_at(self, theta2: float) -> tuple[float, float]:
         start, end = self._window
@@ -194,12 +254,30 @@ class SlaveLaw:
         change = self._weight_to - self._weight
         return self._weight + change * share, change * rate / (end - start)
 
-    def _need_limits(self) -> LawLimits:
-        if self._limits is None:
+    def _need_proof(self) -> LawProof:
+        if self._proof is None:
             raise MotionError("this machine's law is its cam alone")
-        return self._limits
+        return self._proof
 
 
-def _bound(name: str, value: float, limit: float, unit: str) -> None:
-    if value > limit:
-        raise MotionError(f"the slave's {name} would reach {value:.3g} {unit} (bound {limit:g})")
+def _arrived(state: LawState) -> LawState:
+    """The law behind its window."""
+    return LawState(state.shift, state.weight_to, state.weight_to, park=state.park)
+
+
+class TooFastError(MotionError):
+    """The law in force does not allow a speed of the master; ``fastest`` (rad/s) is what it allows."""
+
+    def __init__(self, fastest: float, excess: Excess) -> None:
+        super().__init__(str(excess))
+        self.fastest = fastest
+        self.excess = excess
+
+
+@dataclass(frozen=True, slots=True)
+class Engagement:
+    """A proved way off the cam or back; the window's angles are those of the master's first revolution."""
+
+    is_engaged: bool
+    state: LawState
+    speed: float

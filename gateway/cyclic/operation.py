@@ -1,7 +1,7 @@
 """What an operator may ask of a machine in motion: its speed, a jog, a phase shift, the slave off its cam and back.
 
-Every command is proved against the axes' limits and the linkage's singular positions before it is taken, and carried
-out with limited jerk; one that is refused changes nothing.
+Every order is proved against both axes' limits and the linkage's singular positions before it is taken, and carried
+out with limited jerk; one that is refused changes nothing. A proof goes on beside the motion, one pass a cycle.
 """
 
 import math
@@ -12,9 +12,12 @@ from typing import Final
 from drivers.node import Event
 from gateway.cyclic.demand import CamDemand
 from mechanism.errors import MotionError
+from mechanism.law_proof import Pace, Work
+from mechanism.slave_law import TooFastError
 
-DISENGAGE_WINDOW_RAD: Final = math.radians(60.0)
-"""Of the master, within which the slave leaves its cam or is back on it."""
+PERCENT: Final = 100.0
+NARROWEST_WINDOW_DEG: Final = 1.0
+WIDEST_WINDOW_DEG: Final = 360.0
 
 
 @unique
@@ -22,7 +25,7 @@ class Order(IntEnum):
     """What is asked for."""
 
     OVERRIDE = 1
-    """Per cent of the configured speed, 0 (stand and wait) to 100."""
+    """Per cent of the configured speed: 0 stands and waits, above 100 as far as the limits of both axes allow."""
     JOG = 2
     """rpm of the master, either sign, 0 stands; once it stands and waits."""
     PHASE_SHIFT = 3
@@ -31,6 +34,8 @@ class Order(IntEnum):
     """Master angle in degrees at which the slave begins to leave its cam."""
     ENGAGE = 5
     """Master angle in degrees at which it begins to return."""
+    WINDOW = 6
+    """Degrees of the master within which the slave leaves or is back, from the next such order on; 0: the narrowest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,54 +47,119 @@ class OrderAnswered(Event):
     refusal: str
 
 
+@dataclass(frozen=True, slots=True)
+class OperationLimits:
+    """Speeds of the master in rad/s: 100 per cent, and the fastest jog; the pace at which a phase is shifted; and the
+    window (rad, 0: the narrowest that fits) within which the slave leaves its cam.
+    """
+
+    speed: float
+    jog_speed: float
+    shift: Pace
+    window: float = 0.0
+
+
 class Operation:
-    """Carries out orders on a demand."""
+    """Carries out orders on a demand, one at a time."""
 
-    def __init__(self, demand: CamDemand, speed: float, shift_speed: float, jog_limit: float) -> None:
-        """``speed`` (rad/s) is 100 per cent; ``shift_speed`` and ``jog_limit`` (rad/s) bound shifts and jogs."""
+    def __init__(self, demand: CamDemand, limits: OperationLimits) -> None:
         self._demand = demand
-        self._speed = speed
-        self._shift_speed = shift_speed
-        self._jog_limit = jog_limit
+        self._limits = limits
+        self._window = limits.window
+        self._speed = limits.speed
+        """The speed in force, or that was before the machine was told to wait."""
+        self._work: Work[None] | None = None
+        self._order = Order.OVERRIDE
+        self._value = 0.0
 
-    def carry_out(self, order: Order, value: float, end: float, now_ns: int) -> OrderAnswered:
-        """Take or refuse an order; ``end`` (rad) is where the run is to end, or whole revolutions later."""
+    @property
+    def is_busy(self) -> bool:
+        """An order is being proved: ``go_on`` is to be called once a cycle."""
+        return self._work is not None
+
+    def carry_out(self, order: Order, value: float, end: float, now_ns: int) -> OrderAnswered | None:
+        """Take or refuse an order; None: it is being proved, ``go_on`` will answer it.
+
+        ``end`` (rad) is where the run is to end, or whole revolutions later.
+        """
+        if self._work is not None:
+            return OrderAnswered(now_ns, order, value, "the order before this one is still being looked at")
+        self._order, self._value = order, value
+        self._work = self._carry_out(order, value, end)
+        return self.go_on(now_ns)
+
+    def go_on(self, now_ns: int) -> OrderAnswered | None:
+        """One pass of the proof; the answer if it was the last one."""
         refusal = ""
         try:
-            self._carry_out(order, value, end)
+            if self._work is not None:
+                self._refuse_a_stop()
+                next(self._work)
+                return None
+        except StopIteration:
+            pass
         except MotionError as error:
             refusal = str(error)
-        return OrderAnswered(now_ns, order, value, refusal)
+        self._work = None
+        return OrderAnswered(now_ns, self._order, self._value, refusal)
 
-    def _carry_out(self, order: Order, value: float, end: float) -> None:
-        demand = self._demand
-        if demand.is_stopping or demand.is_finished:
+    def _refuse_a_stop(self) -> None:
+        if self._demand.is_stopping or self._demand.is_finished:
             raise MotionError("the machine is stopping, a new run has to be started")
+
+    def _carry_out(self, order: Order, value: float, end: float) -> Work[None]:
+        demand, limits = self._demand, self._limits
+        # What the operator has not chosen is to hold at the configured speed too, when the override is taken back.
+        speed = max(self._speed, limits.speed)
         match order:
             case Order.OVERRIDE:
-                self._override(value, end)
+                yield from self._override(value, end)
             case Order.JOG:
-                self._jog(value)
+                yield from self._jog(value)
             case Order.PHASE_SHIFT:
-                demand.law.change_shift(math.radians(value), self._speed, self._shift_speed)
+                yield from demand.law.change_shift(math.radians(value), speed, limits.shift)
             case Order.DISENGAGE | Order.ENGAGE:
-                is_engaged = order is Order.ENGAGE
-                at = math.radians(value)
-                demand.law.change_engagement(is_engaged, at, demand.master_position, DISENGAGE_WINDOW_RAD, self._speed)
+                if self._window:
+                    speed = self._speed
+                way = yield from demand.law.prove_engagement(
+                    order is Order.ENGAGE, math.radians(value), self._window, speed
+                )
+                demand.law.engage(way, demand.master_position)
+            case Order.WINDOW:
+                self._set_window(value)
 
-    def _override(self, percent: float, end: float) -> None:
-        if not 0.0 <= percent <= 100.0:
-            raise MotionError(f"an override of {percent:g} % is not 0 to 100 %, for which the limits are proved")
+    def _override(self, percent: float, end: float) -> Work[None]:
+        if not percent >= 0.0:
+            raise MotionError(
+                f"an override of {percent:g} % would turn the machine back; 0 stands, and a jog turns back"
+            )
         if percent == 0.0:
             self._demand.jog(0.0)
-        else:
-            self._demand.go_on(self._speed * percent / 100.0, end)
+            return
+        speed = self._limits.speed * percent / PERCENT
+        try:
+            yield from self._demand.law.prove_speed(speed)
+        except TooFastError as error:
+            fits = math.floor(error.fastest / self._limits.speed * PERCENT)
+            raise MotionError(f"{percent:g} % is too fast, at {fits} % {error.excess.bound}") from None
+        self._demand.go_on(speed, end)
+        self._speed = speed
 
-    def _jog(self, rpm: float) -> None:
+    def _jog(self, rpm: float) -> Work[None]:
         speed = rpm * math.tau / 60.0
         if not self._demand.is_paused:
             raise MotionError("a jog is for a machine that waits: override 0 first")
-        if not abs(speed) <= self._jog_limit:
-            bound = self._jog_limit * 60.0 / math.tau
+        if not abs(speed) <= self._limits.jog_speed:
+            bound = self._limits.jog_speed * 60.0 / math.tau
             raise MotionError(f"a jog at {rpm:g} rpm is faster than it may be (bound {bound:.3g} rpm)")
+        if speed:
+            yield from self._demand.law.prove_speed(speed)
         self._demand.jog(speed)
+
+    def _set_window(self, degrees: float) -> None:
+        if degrees != 0.0 and not NARROWEST_WINDOW_DEG <= degrees <= WIDEST_WINDOW_DEG:
+            raise MotionError(
+                f"a window of {degrees:g} deg is not {NARROWEST_WINDOW_DEG:g} to {WIDEST_WINDOW_DEG:g} deg, or 0 for "
+                "the narrowest that fits"
+            )
+        self._window = math.radians(degrees)

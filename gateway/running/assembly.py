@@ -18,32 +18,16 @@ from gateway.learning.law import Learning, build_learning
 from gateway.running.core import GatewayCore
 from gateway.running.drive_settings import axis_units, build_master, network_settings, node_settings, position_loop
 from gateway.running.machine_session import MachineSession
+from gateway.running.operation_setup import operation_limits, slave_law
 from gateway.running.powering import AxisSetup
 from gateway.running.preparation import plan
 from mechanism.approach import ApproachField
 from mechanism.cam_profile import CamProfile
 from mechanism.deviation import harmless_error
 from mechanism.motion import MasterPlan
-from mechanism.slave_law import LawLimits, SlaveLaw
+from mechanism.slave_law import SlaveLaw
 
-JOG_SHARE: Final = 4.0
-"""A jog is at most so many times slower than the run."""
 NS_PER_US: Final = 1000
-
-
-def slave_law(config: GatewayConfig, profile: CamProfile) -> SlaveLaw:
-    """Where the slave is for every angle of the master: on the cam, until somebody shifts it or takes it off."""
-    slave = config.ordered_axes[1].limits
-    return SlaveLaw(
-        profile,
-        LawLimits(
-            five_bar(config),
-            closure_at_home(config, desired_curve(config)),
-            config.machine.minimum_transmission_sine,
-            slave.velocity_rad_per_s,
-            slave.acceleration_rad_per_s2,
-        ),
-    )
 
 
 def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits], CamWindow]:
@@ -155,10 +139,7 @@ def build_core(
         approach,
         config.recovery.timeout_s,
     )
-    operation = Operation(
-        demand, config.speed_rad_per_s, config.motion.approach_speed_rad_per_s, config.speed_rad_per_s / JOG_SHARE
-    )
-    return GatewayCore(session, operation, config.bus.sdo_frames_a_cycle)
+    return GatewayCore(session, Operation(demand, operation_limits(config)), config.bus.sdo_frames_a_cycle)
 
 
 def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: int) -> Approach:

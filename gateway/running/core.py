@@ -30,7 +30,7 @@ class GatewayCore:
         self.master = session.master
         self.is_done = False
         self._guard = session.guard
-        self._events = session.events
+        self._events: list[Event] = session.events
         self._operation = operation
         self._sdo_pacing = SdoPacing(sdo_frames_a_cycle)
         self._lost: list[str] = []
@@ -133,7 +133,8 @@ class GatewayCore:
             answer = OrderAnswered(now_ns, order, value, "the machine is not in motion on its cam")
         else:
             answer = self._operation.carry_out(order, value, session.plan.end_position, now_ns)
-        self._events.append(answer)
+        if answer is not None:
+            self._events.append(answer)
 
     def request_quick_stop(self) -> None:
         """Quick stop on all drives."""
@@ -180,6 +181,10 @@ class GatewayCore:
         if self.is_done:
             return
         self.master.now_ns = now_ns
+        if self._operation is not None and self._operation.is_busy:
+            answer = self._operation.go_on(now_ns)
+            if answer is not None:
+                self._events.append(answer)
         if self._procedure is None:
             self._procedure = self.session.run()
         session = self.session
