@@ -11,11 +11,13 @@ CONTROL_EPILOG = """Examples, while a run of paper is going on in another termin
 
 \b
   drive-gateway control paper override 50        half speed
+  drive-gateway control paper override 110       faster than configured, as far as the limits of both axes go
   drive-gateway control paper override 0         stand, on the cam, and wait
   drive-gateway control paper jog -- -6          back at 6 rpm; jog 0 stands again; override 100 goes on
   drive-gateway control paper phase-shift 5      the slave 5 deg of the master ahead on its cam
   drive-gateway control paper disengage 200      the slave leaves its cam where the master is at 200 deg
   drive-gateway control paper engage 200 --json
+  drive-gateway control paper window 45          from now on it leaves and returns within 45 deg; 0: the narrowest
 
 Every order is proved against the axes' limits and the singular positions first; a refusal says why, with status 1.
 """
@@ -29,12 +31,13 @@ class OrderName(Enum):
     PHASE_SHIFT = "phase-shift"
     DISENGAGE = "disengage"
     ENGAGE = "engage"
+    WINDOW = "window"
 
 
 def control(
     config: ConfigArgument,
     order: Annotated[
-        OrderName, typer.Argument(metavar="ORDER", help="override, jog, phase-shift, disengage or engage.")
+        OrderName, typer.Argument(metavar="ORDER", help="override, jog, phase-shift, disengage, engage or window.")
     ],
     value: Annotated[float, typer.Argument(metavar="VALUE", help="Per cent, rpm, or degrees of the master.")],
     as_json: JsonOption = False,

@@ -200,6 +200,13 @@ class CamDemand:
         self.is_paused = True
 
     @property
+    def top_speed(self) -> float:
+        """Speed that the master does not exceed from here on unless told otherwise, rad/s."""
+        cruise = 0.0 if self._plan is None else abs(self._plan.cruise_speed)
+        # An acceleration that has to be taken back first still adds a^2 / (2 j).
+        return max(cruise, abs(self.master_velocity) + 0.5 * self._acceleration**2 / self._limits[1])
+
+    @property
     def is_stopping(self) -> bool:
         """A controlled stop is under way, or done: nothing goes on after it."""
         return self._is_stopping

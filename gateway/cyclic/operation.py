@@ -109,8 +109,9 @@ class Operation:
 
     def _carry_out(self, order: Order, value: float, end: float) -> Work[None]:
         demand, limits = self._demand, self._limits
+        chosen = max(self._speed, demand.top_speed)
         # What the operator has not chosen is to hold at the configured speed too, when the override is taken back.
-        speed = max(self._speed, limits.speed)
+        speed = max(chosen, limits.speed)
         match order:
             case Order.OVERRIDE:
                 yield from self._override(value, end)
@@ -119,10 +120,8 @@ class Operation:
             case Order.PHASE_SHIFT:
                 yield from demand.law.change_shift(math.radians(value), speed, limits.shift)
             case Order.DISENGAGE | Order.ENGAGE:
-                if self._window:
-                    speed = self._speed
                 way = yield from demand.law.prove_engagement(
-                    order is Order.ENGAGE, math.radians(value), self._window, speed
+                    order is Order.ENGAGE, math.radians(value), self._window, chosen if self._window else speed
                 )
                 demand.law.engage(way, demand.master_position)
             case Order.WINDOW:
