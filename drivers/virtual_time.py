@@ -19,6 +19,7 @@ MAX_WAKES_PER_INSTANT: Final = 10_000
 """How often one node may be woken while the time stands still, before that is taken for a fault of the node."""
 
 _NEVER: Final = 1 << 63
+_ATTEMPTS: Final = range(MAX_WAKES_PER_INSTANT)
 
 
 class LivelockError(DriveError):
@@ -81,6 +82,7 @@ class VirtualBus:
         "_on_wire",
         "_queues",
         "_sender",
+        "_sleepers",
         "_source",
         "_trace",
         "_wakes",
@@ -131,13 +133,15 @@ class VirtualBus:
         self._late: list[tuple[int, int, int, Frame]] = []
         self._late_count: Final = itertools.count()
         # Bound methods looked up once: delivering a frame is most of what a run does.
-        stations = tuple(
-            (index, node.receive, node.take_frames, node.next_wake_ns, node.take_events, self._queues[index])
-            for index, node in enumerate(self.nodes)
-        )
         self._listeners: Final = tuple(
-            tuple(station for station in stations if station[0] != sender) for sender in range(len(self.nodes))
+            tuple(
+                (index, node.receive, node.take_frames, node.next_wake_ns, node.take_events, self._queues[index])
+                for index, node in enumerate(self.nodes)
+                if index != sender
+            )
+            for sender in range(len(self.nodes))
         )
+        self._sleepers: Final = tuple((index, node.wake, node.next_wake_ns) for index, node in enumerate(self.nodes))
 
     @property
     def now_ns(self) -> int:
@@ -190,6 +194,7 @@ class VirtualBus:
         now_ns = self._now_ns
         sender = self._sender
         frame = self._on_wire
+        frame_ns = 0 if frame is None else wire_ns[len(frame.data)]
         frame_end_ns = self._frame_end_ns
         if frame is None and any(self._queues):
             # The wire is free and frames wait: as if a frame ended now, so that the first instant arbitrates.
@@ -211,7 +216,7 @@ class VirtualBus:
                 if is_frame_ending:
                     ended, frame, frame_end_ns = frame, None, _NEVER
                     if ended is not None:
-                        self._busy_ns += wire_ns[len(ended.data)]
+                        self._busy_ns += frame_ns
                         self._frame_count += 1
                         if self._faults is None:
                             self._deliver(sender, ended, now_ns)
@@ -233,7 +238,9 @@ class VirtualBus:
                                 sender = index
                     if best != _NEVER:
                         frame = self._queues[sender].popleft()
-                        frame_end_ns = now_ns + wire_ns[len(frame.data)]
+                        _, data, _ = frame
+                        frame_ns = wire_ns[len(data)]
+                        frame_end_ns = now_ns + frame_ns
         finally:
             self._sender = sender
             self._on_wire = frame
@@ -258,8 +265,10 @@ class VirtualBus:
         if self._trace is not None:
             self._trace(now_ns, frame)
         wakes = self._wakes
+        on_event = self._on_event
         for index, receive, take_frames, next_wake_ns, take_events, queue in self._listeners[sender]:
-            receive(frame, now_ns)
+            if receive(frame, now_ns) is False:
+                continue
             frames = take_frames()
             if frames:
                 queue.extend(frames)
@@ -269,23 +278,26 @@ class VirtualBus:
             if wake_ns != wakes[index]:
                 wakes[index] = wake_ns
                 self._earliest_wake_ns = min(wakes)
-            if self._on_event is not None:
+            if on_event is not None:
                 for event in take_events():
-                    self._on_event(index, event)
+                    on_event(index, event)
 
     def _wake_due(self, now_ns: int) -> None:
         """Wake the nodes that are due, in their order, each until it wants nothing more at this instant."""
         wakes = self._wakes
-        for index, node in enumerate(self.nodes):
+        for index, wake, next_wake_ns in self._sleepers:
             if wakes[index] > now_ns:
                 continue
-            for _ in range(MAX_WAKES_PER_INSTANT):
-                node.wake(now_ns)
-                self._settle(index)
+            for _ in _ATTEMPTS:
+                if wake(now_ns) is False:
+                    wake_ns = next_wake_ns()
+                    wakes[index] = _NEVER if wake_ns is None else wake_ns
+                else:
+                    self._settle(index)
                 if wakes[index] > now_ns:
                     break
             else:
-                raise LivelockError(index, node, now_ns, wakes[index], MAX_WAKES_PER_INSTANT)
+                raise LivelockError(index, self.nodes[index], now_ns, wakes[index], MAX_WAKES_PER_INSTANT)
         self._earliest_wake_ns = min(wakes)
 
     def _settle(self, index: int) -> None:

@@ -319,33 +319,41 @@ class EmulatedMachine:
             self._ask_wake(station)
         self._exchange(now_ns)
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
-        """Hand a frame of the bus to the drives that listen to it."""
-        if self._due_ns < now_ns:
+    def receive(self, frame: Frame, now_ns: int) -> bool:
+        """Hand a frame of the bus to the drives that listen to it; False as in ``drivers.node.Node``."""
+        has_news = self._due_ns < now_ns
+        if has_news:
             self.wake(now_ns)
-        listeners = self._routes.get(frame.cob_id)
+        cob_id, data, is_remote = frame
+        listeners = self._routes.get(cob_id)
         if listeners is None:
-            return
+            return has_news
         is_quiet = True
         for station, handler in listeners:
-            if handler is None or frame.is_remote:
+            if handler is None or is_remote:
                 station.receive(frame, now_ns)
             else:
-                handler(frame.data, now_ns)
+                handler(data, now_ns)
             drive = station.drive
             if drive.is_wake_stale:
                 self._ask_wake(station)
+                has_news = True
             if station.outbox or station.events or drive.subscriptions_changed:
                 is_quiet = False
-        if not is_quiet:
-            self._exchange(now_ns)
+        if is_quiet:
+            return has_news
+        self._exchange(now_ns)
+        return True
 
     def next_wake_ns(self) -> int | None:
         """The next servo tick or the next wake of a drive; never None, for the servo ticks never end."""
         return self._due_ns
 
-    def wake(self, now_ns: int) -> None:
-        """Run every servo tick and every drive's wake that is due, each at its own instant."""
+    def wake(self, now_ns: int) -> bool:
+        """Run every servo tick and every drive's wake that is due, each at its own instant.
+
+        False as in ``drivers.node.Node``.
+        """
         if now_ns - self._next_tick_ns > MAX_CATCH_UP_NS:
             self._skip_to(now_ns)
         while self._due_ns <= now_ns:
@@ -354,6 +362,7 @@ class EmulatedMachine:
             else:
                 due = next(station for station in self._stations if station.due_ns == self._due_ns)
                 self._wake_drive(due, self._due_ns)
+        return bool(self._frames or self._events)
 
     def take_frames(self) -> list[Frame]:
         """Frames of all drives in the order they were sent."""

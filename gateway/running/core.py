@@ -55,21 +55,24 @@ class GatewayCore:
 
     # -- the seam ------------------------------------------------------------------------------------------------
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
-        """Take a frame: a TPDO goes to the cycle, everything else to the master."""
+    def receive(self, frame: Frame, now_ns: int) -> bool:
+        """Take a frame: a TPDO goes to the cycle, everything else to the master; False as in ``drivers.node.Node``."""
         loop = self.loop
-        number = loop.tpdo_slots.get(frame.cob_id)
+        cob_id, data, is_remote = frame
+        number = loop.tpdo_slots.get(cob_id)
         if number is not None:
-            if loop.is_running and not frame.is_remote and loop.receive_tpdo(number, frame.data, now_ns):
+            is_closing = loop.is_running and not is_remote and loop.receive_tpdo(number, data, now_ns)
+            if is_closing:
                 self._resume(now_ns)
-            return
-        if frame.cob_id == SYNC_COB_ID:
+            return is_closing
+        if cob_id == SYNC_COB_ID:
             if loop.is_running and loop.receive_sync(now_ns):
                 self._resume(now_ns)
-            return
+            return True
         self.master.receive(frame, now_ns)
         self._watch(now_ns)
         self._resume(now_ns)
+        return True
 
     def next_wake_ns(self) -> int | None:
         """The earliest of cycle, heartbeats and the session's own time-out; None when the session is over."""

@@ -136,6 +136,48 @@ def test_time_does_not_run_backwards() -> None:
         VirtualBus([], 0)
 
 
+def test_a_node_that_says_that_nothing_has_come_of_it_is_not_asked() -> None:
+    class Quiet(ScriptedNode):
+        """Silent until 300 us; what it then has to say has been put there by a frame before."""
+
+        def __init__(self) -> None:
+            super().__init__({300_000: [SYNC]})
+            self.questions: list[str] = []
+
+        def receive(self, frame: Frame, now_ns: int) -> bool:
+            super().receive(frame, now_ns)
+            return False
+
+        def wake(self, now_ns: int) -> bool:
+            super().wake(now_ns)
+            return bool(self.out)
+
+        def next_wake_ns(self) -> int | None:
+            self.questions.append("wake")
+            return self.sends[0][0] if self.sends else None
+
+        def take_frames(self) -> list[Frame]:
+            self.questions.append("frames")
+            return super().take_frames()
+
+    quiet = Quiet()
+    quiet.sends.insert(0, (200_000, []))
+    frames: list[str] = []
+    bus = VirtualBus(
+        [ScriptedNode({0: [SYNC, Frame(0x181)]}), quiet], MEGABIT, trace=lambda _, f: frames.append(str(f))
+    )
+    bus.run_until(150_000)
+    quiet.questions.clear()
+    bus.run_until(190_000)
+    assert quiet.questions == ["frames", "wake"]  # of the run's beginning
+    assert [what for what, _ in quiet.log] == ["080#", "181#"]
+    quiet.questions.clear()
+    bus.run_until(250_000)
+    assert quiet.questions == ["frames", "wake", "wake", "wake"]  # its own wake asks for the next one, too
+    bus.run_until(400_000)
+    assert frames == ["080#", "181#", "080#"]
+
+
 def test_events_are_handed_on_with_the_node_they_come_from() -> None:
     seen: list[tuple[int, Event]] = []
     nodes = [ScriptedNode({0: [SYNC]}), ScriptedNode(), ScriptedNode()]
