@@ -6,7 +6,7 @@ singular position, stays. Cheapest ways from the cam to all cells are found once
 followed and drawn straight.
 """
 
-from math import ceil, degrees, hypot, pi, radians, tau
+from math import ceil, degrees, hypot, inf, pi, radians, remainder, tau
 from typing import Any, Final, cast
 
 import numpy as np
@@ -40,7 +40,11 @@ _NEIGHBOURS: Final = ((1, 0), (0, 1), (1, 1), (1, -1))
 
 
 class ApproachField:
-    """Ways onto one cam. Raises ApproachError for a cam whose slave gains turns, for which none are known."""
+    """Ways onto one cam.
+
+    A slave that gains turns on its cam can turn without end, as the master does: its rows close in a circle too, and a
+    way ends in the revolution of the slave that is nearest.
+    """
 
     def __init__(
         self,
@@ -50,18 +54,25 @@ class ApproachField:
         minimum_sine: float,
         servo_limits: tuple[float, float] | None = None,
     ) -> None:
-        """``minimum_sine`` is that of the angle between q and r; ``servo_limits`` bound theta5 (rad)."""
-        if cam.net_turns:
-            raise ApproachError("a cam whose slave turns on and on has no approach from elsewhere")
+        """``minimum_sine`` is that of the angle between q and r; ``servo_limits`` bound theta5 (rad).
+
+        Raises ApproachError for limits of a slave that turns without end.
+        """
+        self._is_turning = cam.net_turns != 0
+        if self._is_turning and servo_limits is not None:
+            raise ApproachError("the servo axis gains turns on its cam and can have no limits of its position")
         self._five_bar = five_bar
         self._closure = closure
         self._cam = cam
         self._minimum_sine = minimum_sine
         around = cam.at_many(np.arange(CELLS_PER_TURN) * CELL)[:, 0]
         middle = 0.5 * float(around.min() + around.max())
-        self._low, self._high = servo_limits or (middle - pi, middle + pi)
-        self._first = self._low - OUTSIDE
-        self._rows = ceil((self._high + OUTSIDE - self._first) / CELL) + 1
+        if self._is_turning:
+            self._low, self._high, self._first, self._rows = -inf, inf, 0.0, CELLS_PER_TURN
+        else:
+            self._low, self._high = servo_limits or (middle - pi, middle + pi)
+            self._first = self._low - OUTSIDE
+            self._rows = ceil((self._high + OUTSIDE - self._first) / CELL) + 1
         self._clearance = self._find_clearance()
         self._ways = self._find_ways(around)
 
@@ -83,7 +94,7 @@ class ApproachField:
                 else f"where the transmission sine is {sine:.3f}"
             )
             raise ApproachError(f"{here}, {what} (bound {self._minimum_sine:g}); bring it away from there by hand")
-        straight = (theta2, self._cam.at(theta2)[0])
+        straight = (theta2, self._cam_near(theta2, theta5))
         if self._is_free((theta2, theta5), straight):
             return (theta2, theta5), straight
         cells = self._cells_from(theta2, theta5)
@@ -93,8 +104,13 @@ class ApproachField:
                 f"{self._minimum_sine:g} (a change of closure would be needed); bring it onto the cam by hand"
             )
         last = cells[-1][0]
-        points = [(theta2, theta5), *cells, (last, self._cam.at(last)[0])]
+        points = [(theta2, theta5), *cells, (last, self._cam_near(*cells[-1]))]
         return self._straightened(points)
+
+    def _cam_near(self, theta2: float, theta5: float) -> float:
+        """theta5 of the cam where the master is at theta2; of a slave that turns without end, nearest to ``theta5``."""
+        on_cam = self._cam.at(theta2)[0]
+        return theta5 - remainder(theta5 - on_cam, tau) if self._is_turning else on_cam
 
     def _find_clearance(self) -> Float:
         """abs(sin(theta3 - theta4)) at the cells' centres, shape (turn, rows); 0 where the linkage does not close."""
@@ -117,12 +133,14 @@ class ApproachField:
         for over, up in _NEIGHBOURS:
             to = np.roll(np.roll(number, -over, axis=0), -up, axis=1)
             both = free & free.ravel()[to]
-            # Nothing goes round from the highest row to the lowest.
-            both[:, rows - 1 if up > 0 else 0] &= up == 0
+            if not self._is_turning:
+                # Nothing goes round from the highest row to the lowest.
+                both[:, rows - 1 if up > 0 else 0] &= up == 0
             starts.append(number[both])
             ends.append(to[both])
             weights.append(hypot(over, up) * CELL * 0.5 * (cost[both] + cost.ravel()[to[both]]))
-        cam_rows = np.clip(np.rint((around - self._first) / CELL).astype(np.intp), 0, rows - 1)
+        cam_rows = np.rint((around - self._first) / CELL).astype(np.intp)
+        cam_rows = cam_rows % rows if self._is_turning else np.clip(cam_rows, 0, rows - 1)
         cam_cells = number[np.arange(CELLS_PER_TURN), cam_rows]
         source = number.size
         starts.append(np.full(CELLS_PER_TURN, source))
@@ -141,23 +159,29 @@ class ApproachField:
         column, row = round(theta2 / CELL), round((theta5 - self._first) / CELL)
         # The nearest cell may itself be barred by its margin, and a neighbour may not.
         around = sorted(_AROUND, key=lambda over: hypot(*over))
-        places = [(column + over, min(max(row + up, 0), self._rows - 1)) for over, up in around]
+        places = [(column + over, self._row(row + up)) for over, up in around]
         start = next((place for place in places if self._leads_on(place, (theta2, theta5))), None)
         if start is None:
             return None
         column, row = start
-        cell = (column % CELLS_PER_TURN) * self._rows + row
+        cell = (column % CELLS_PER_TURN) * self._rows + row % self._rows
         points: list[Point] = []
         while cell != source:
             step = (cell // self._rows - column + CELLS_PER_TURN // 2) % CELLS_PER_TURN - CELLS_PER_TURN // 2
             column += step
-            points.append((column * CELL, self._first + cell % self._rows * CELL))
+            up = cell % self._rows - row
+            row += (up + self._rows // 2) % self._rows - self._rows // 2 if self._is_turning else up
+            points.append((column * CELL, self._first + row * CELL))
             cell = int(self._ways[cell])
         return points
 
+    def _row(self, row: int) -> int:
+        """The row itself, or the nearest there is."""
+        return row if self._is_turning else min(max(row, 0), self._rows - 1)
+
     def _leads_on(self, place: tuple[int, int], start: Point) -> bool:
         column, row = place
-        has_way = self._ways[(column % CELLS_PER_TURN) * self._rows + row] >= 0
+        has_way = self._ways[(column % CELLS_PER_TURN) * self._rows + row % self._rows] >= 0
         return bool(has_way) and self._is_free(start, (column * CELL, self._first + row * CELL))
 
     def _straightened(self, points: list[Point]) -> tuple[Point, ...]:

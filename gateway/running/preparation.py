@@ -74,6 +74,7 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
         *cam.violations,
         *_ramp_violations(config, cam.profile),
         *_home_violations(config, cam.profile),
+        *_turning_violations(config, cam.profile),
         *_guard_violations(config, cam.profile),
         *torque_violations(config, cam.profile),
     )
@@ -149,6 +150,20 @@ def _home_violations(config: GatewayConfig, profile: CamProfile) -> list[Gateway
         GatewayError(
             f"axes.{name}.home_angle_deg: {math.degrees(theta5):g} is {abs(distance)} counts from the cam, which has "
             f"{math.degrees(on_cam):.3f} deg where the master is at home (bound {window} counts)"
+        )
+    ]
+
+
+def _turning_violations(config: GatewayConfig, profile: CamProfile) -> list[GatewayError]:
+    """A slave that gains turns passes every angle sooner or later."""
+    slave = config.ordered_axes[1]
+    if not profile.net_turns or slave.limits.position_deg is None:
+        return []
+    turns = f"{abs(profile.net_turns)} turn{'s' if abs(profile.net_turns) > 1 else ''}"
+    return [
+        GatewayError(
+            f"axes.{config.axis_names[1]}.limits.position_deg: the servo axis gains {turns} on its cam with every "
+            "revolution of the master and would pass any limit, leave it out"
         )
     ]
 

@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from turning_machine import CLOSURE as DOUBLE_CRANK_CLOSURE
+from turning_machine import LINKS as DOUBLE_CRANK
+from turning_machine import servo_angle, turning_config
 
 from config.conversion import five_bar
 from config.loading import load_config
-from gateway.running.preparation import compile_config
+from gateway.running.preparation import compile_config, prepare
 from mechanism.approach import ApproachField
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import ApproachError
@@ -92,7 +95,71 @@ def test_two_islands_have_no_way_between_them():
         field.path(0.0, float(grid[~(np.nan_to_num(sines) > 0.1)][0]))
 
 
-def test_a_cam_that_turns_on_is_refused():
-    turning = CamProfile.through(np.arange(64) * math.tau / 64, np.arange(64) * math.tau / 64, net_turns=1, knots=64)
-    with pytest.raises(ApproachError, match="turns on and on"):
-        ApproachField(LINKS, Closure.LEFT, turning, 0.1)
+def ways_from_everywhere(field, links, closure, low, high, count):
+    """Seeded starts all over the reachable space: the sine there, and the least one on the way (0: refused)."""
+    chance = np.random.default_rng(5)
+    found = []
+    for theta2, theta5 in zip(chance.uniform(0.0, math.tau, count), chance.uniform(low, high, count), strict=True):
+        here = np.nan_to_num(np.abs(links.transmission_sines(theta2, theta5, closure)[..., 0]))
+        try:
+            corners = field.path(float(theta2), float(theta5))
+        except ApproachError:
+            found.append((float(here), 0.0))
+            continue
+        sines = sines_along(corners, links, closure)
+        assert np.all(sines * int(closure) < 0.0)
+        found.append((float(here), float(np.abs(sines).min())))
+    return np.array(found)
+
+
+def assert_bound_is_kept(found, bound=0.1):
+    here, least = found.T
+    # Every start from which the linkage may move at all is brought onto the cam.
+    assert np.all((least > 0.0) == (here >= bound))
+    # A line is looked at every quarter of a degree; what lies between is no more than this below the bound.
+    assert least[least > 0.0].min() >= bound * 0.998
+
+
+def test_from_everywhere_within_the_servos_limits_the_bound_is_kept():
+    low, high = math.radians(-10 - 12), math.radians(110 + 12)
+    found = ways_from_everywhere(FIELD, LINKS, Closure.LEFT, low, high, 1000)
+    assert_bound_is_kept(found)
+    assert (found[:, 1] > 0.0).mean() > 0.97
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory):
+    config = turning_config(tmp_path_factory.mktemp("turning"))
+    return config, compile_config(config).profile
+
+
+def test_a_slave_that_gains_turns_has_ways_onto_its_cam_from_everywhere(turning):
+    _, profile = turning
+    assert profile.net_turns == 1
+    field = ApproachField(DOUBLE_CRANK, DOUBLE_CRANK_CLOSURE, profile, 0.1)
+    found = ways_from_everywhere(field, DOUBLE_CRANK, DOUBLE_CRANK_CLOSURE, -1000.0, 1000.0, 1000)
+    assert_bound_is_kept(found)
+    # 4 % of its positions are barred, and none of the others is.
+    assert 0.94 < (found[:, 1] > 0.0).mean() < 0.98
+
+
+@pytest.mark.parametrize("turns", [-3, 0, 7])
+def test_a_way_onto_a_turning_cam_ends_in_the_nearest_revolution_of_both(turning, turns):
+    _, profile = turning
+    field = ApproachField(DOUBLE_CRANK, DOUBLE_CRANK_CLOSURE, profile, 0.1)
+    theta2 = 1.0 + turns * math.tau
+    theta5 = 1.0 + 4 * math.tau
+    corners = field.path(theta2, theta5)
+    last2, last5 = corners[-1]
+    assert math.remainder(last5 - servo_angle(last2), math.tau) == pytest.approx(0.0, abs=1e-6)
+    assert max(abs(last2 - theta2), abs(last5 - theta5)) < math.pi
+
+
+def test_a_slave_that_gains_turns_can_have_no_position_limits(turning, tmp_path):
+    _, profile = turning
+    with pytest.raises(ApproachError, match="can have no limits of its position"):
+        ApproachField(DOUBLE_CRANK, DOUBLE_CRANK_CLOSURE, profile, 0.1, (0.0, 9.0))
+    jerk = "jerk_rad_per_s3: 20000.0\n"
+    limited = turning_config(tmp_path, ((jerk, jerk + "      position_deg: [-1000, 1000]\n"),))
+    [violation] = prepare(limited, is_strict=False).violations
+    assert "axes.servo.limits.position_deg: the servo axis gains 1 turn on its cam" in str(violation)

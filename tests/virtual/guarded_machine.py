@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -48,8 +49,8 @@ def changed(*replacements: tuple[str, str]) -> GatewayConfig:
 
 
 @lru_cache(maxsize=8)
-def prepared_run(text: str, cycles: int) -> PreparedRun:
-    return prepare(parse_config(text, PAPER.path), cycles)
+def prepared_run(text: str, path: Path, cycles: int) -> PreparedRun:
+    return prepare(parse_config(text, path), cycles)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ class Guarded:
     ) -> None:
         """``host``: what drives the gateway's core on the bus in its place."""
         self.config = config
-        self.prepared = prepared_run(config.text, cycles)
+        self.prepared = prepared_run(config.text, config.path, cycles)
         self.machine = build_machine(config, record_ticks=200_000)
         brakes = (Fault(FaultKind.BROKEN_BRAKE, node, 1.0) for node in (CV, SERVO) if is_brakeless)
         self.injector = Injector(self.machine, (*faults, *brakes), seed)

@@ -4,7 +4,9 @@ import itertools
 import math
 
 import pytest
-from guarded_machine import PAPER, SECOND, Guarded, at_theta2
+from guarded_machine import SECOND, Guarded, at_theta2
+from turning_machine import CLOSURE, turning_config
+from turning_machine import LINKS as DOUBLE_CRANK
 
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
@@ -16,17 +18,19 @@ class Again:
     """A second session with the machine of a first one, whose axes have meanwhile been brought to other angles."""
 
     def __init__(self, first, theta2_deg=None, theta5_deg=None):
+        config = first.config
         self.machine, self.samples = first.machine, []
         if theta2_deg is not None:
             self.machine.plant.set_motion((math.radians(theta2_deg), math.radians(theta5_deg)), (0.0, 0.0))
-        bus = VirtualBus([self.machine], PAPER.bus.bit_rate, start_ns=first.bus.now_ns)
+        bus = VirtualBus([self.machine], config.bus.bit_rate, start_ns=first.bus.now_ns)
         bus.run_until(first.bus.now_ns + SECOND // 2)
         self.prepared = first.prepared
-        self.core = build_core(PAPER, self.prepared.cam.profile, self.prepared.plan, self, approach_cycles=1)
+        self.core = build_core(config, self.prepared.cam.profile, self.prepared.plan, self, approach_cycles=1)
         self.events = []
+        self.config = config
         self.bus = VirtualBus(
             [self.core, self.machine],
-            PAPER.bus.bit_rate,
+            config.bus.bit_rate,
             start_ns=bus.now_ns,
             on_event=lambda _, event: self.events.append(event),
         )
@@ -90,3 +94,29 @@ def test_a_stop_on_the_way_is_one_and_a_place_without_a_way_is_refused():
     refused.to_end()
     assert "bound 0.1" in str(refused.core.failure)
     assert not any(drive.is_powered for drive in refused.machine.drives)
+
+
+def stopped_turning_machine(folder):
+    run = Guarded(config=turning_config(folder), cycles=3).until(3.5)
+    run.core.request_stop()
+    run.bus.refresh()
+    return run.to_end()
+
+
+@pytest.mark.slow
+def test_a_slave_that_turns_on_and_on_is_brought_back_onto_its_cam_in_any_revolution(tmp_path):
+    first = stopped_turning_machine(tmp_path)
+    theta2, theta5 = (math.degrees(first.machine.plant.angle(axis)) for axis in (0, 1))
+    assert theta5 > 400.0
+    # Moved by hand, the slave by more than a revolution.
+    again = Again(first, theta2 - 100.0, theta5 + 400.0).to_end()
+    again.assert_approached_and_ran_home()
+    sine = abs(DOUBLE_CRANK.transmission_sines(*(again.machine.plant.angle(n) for n in (0, 1)), CLOSURE)[0])
+    assert sine == pytest.approx(abs(DOUBLE_CRANK.transmission_sines(0.0, math.pi / 2, CLOSURE)[0]), abs=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("theta2", "theta5"), [(0, 0), (120, 120), (200, 330), (60, 300), (270, 45)])
+def test_a_slave_that_turns_from_wherever_it_was_moved_by_hand(theta2, theta5, tmp_path):
+    first = stopped_turning_machine(tmp_path)
+    Again(first, theta2 + 720.0, theta5).to_end().assert_approached_and_ran_home()

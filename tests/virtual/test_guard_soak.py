@@ -68,7 +68,7 @@ class Soak:
     def session(self, seed):
         source = random.Random(seed)
         faults = [random_fault(source) for _ in range(source.choice((1, 1, 2)))]
-        prepared = prepared_run(NOISY.text, 2)
+        prepared = prepared_run(NOISY.text, NOISY.path, 2)
         machine = build_machine(NOISY, seed, record_ticks=8192)
         core = build_core(NOISY, prepared.cam.profile, prepared.plan, self)
         events = []

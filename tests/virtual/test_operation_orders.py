@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from guarded_machine import PAPER, SECOND, Guarded, at_theta2, changed
+from turning_machine import turning_config
 
 from gateway.cyclic.guard import StopReason
 from gateway.cyclic.operation import Order, OrderAnswered
@@ -196,3 +197,24 @@ def test_a_quick_stop_with_the_slave_off_its_cam_leaves_it_there():
     assert run.machine.plant.angle(1) == pytest.approx(parked, abs=math.radians(4.0))
     assert run.is_without_torque
     assert not run.is_torn
+
+
+def test_a_slave_that_turns_on_and_on_returns_in_the_revolution_in_which_it_was_parked(tmp_path):
+    run = Operated(config=turning_config(tmp_path), cycles=3).order(1.5, Order.DISENGAGE, 30.0).until(4.0)
+    parked = run.machine.plant.angle(1)
+    run.order(4.2, Order.ENGAGE, 100.0)
+    # The master, of whose motion no feed-forward knows, swings it by 1.4 deg.
+    assert run.machine.plant.angle(1) == pytest.approx(parked, abs=math.radians(3.0))
+    run.to_end()
+    assert run.refusals == ["", ""]
+    assert run.stopped_by is StopReason.COMPLETED
+    assert run.trips == []
+    master, slave = (run.machine.plant.angle(axis) for axis in (0, 1))
+    # It has missed whole revolutions while it was parked, and stands at home as the master does.
+    missed = (master - (slave - math.pi / 2)) / math.tau
+    assert round(missed) >= 1
+    assert missed == pytest.approx(round(missed), abs=0.01)
+    samples = samples_of(run)
+    moving = (samples["phase"] >= Phase.RAMP_UP) & (samples["phase"] <= Phase.CONTROLLED_STOP)
+    steps = np.abs(np.diff(samples["position_demand"][moving, 1].astype(np.int64)))
+    assert steps.max() <= 8
