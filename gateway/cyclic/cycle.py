@@ -21,10 +21,12 @@ from drivers.pdo import PdoLayout
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.demand import Demand
 from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.lateness import Late
 from gateway.cyclic.position_loop import PositionLoop
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
-from gateway.record.sample import INT32_MAX, Phase, SampleFlag, saturate_int32
+from gateway.record.lateness import LateKind
+from gateway.record.sample import INT32_MAX, MISSED_TPDO_MASK, Phase, SampleFlag, saturate_int32
 from gateway.units import HALF_RANGE, RANGE_MASK
 
 __all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop", "SampleSink"]
@@ -41,6 +43,8 @@ SYNC_PATIENCE: Final = 2
 """A SYNC that is late by this part of the period counts as missing."""
 SYNC_TAKE_OVER: Final = 3
 """After so many missing SYNCs in a row the loop sends them itself."""
+_UNSENT_NS: Final = 1
+"""A demand that is made only after its SYNC counts as this late; how late it really is nobody knows yet."""
 GRID_FILTER: Final = 2
 """The expected grid follows a late SYNC by this part of the lateness: the kernel sets its timer anew after each SYNC,
 and its grid slips by what each of them is late."""
@@ -63,6 +67,18 @@ class SampleSink(Protocol):
 
     def append(self, *values: float) -> None:
         """Take one sample, the values in the order of ``SampleLayout.pack_into``."""
+        ...
+
+
+class LateListener(Protocol):
+    """Who is told of what was late."""
+
+    def missed(self, late: Late) -> None:
+        """A demand was not on the bus before its SYNC, or a SYNC was a cycle late."""
+        ...
+
+    def demand_is_out(self, at_ns: int) -> None:
+        """The demand that was told as missed before it was on the bus was there at this time."""
         ...
 
 
@@ -96,7 +112,6 @@ class CyclicLoop:
         "_awaited",
         "_coupled_stop",
         "_cpu_clock",
-        "_cpu_last_ns",
         "_cpu_ns",
         "_deadline_share_ns",
         "_demand",
@@ -125,10 +140,12 @@ class CyclicLoop:
         "is_guarding_enabled",
         "is_paced",
         "is_running",
+        "late_listener",
         "missing_syncs",
         "outbox",
         "period_ns",
         "phase",
+        "processor_read_ns",
         "sync_gap_limit",
         "sync_period_ns",
         "tpdo_slots",
@@ -163,6 +180,7 @@ class CyclicLoop:
         """SYNCs in a row that were due and not seen."""
         self.actuals_are_valid = False
         """Every axis has sent a TPDO for the cycle that was closed last."""
+        self.late_listener: LateListener | None = None
         self.phase = Phase.COMMISSIONING
         self.is_guarding_enabled = False
         """Set while all drives are meant to be in Operation enabled."""
@@ -175,7 +193,8 @@ class CyclicLoop:
         self._sink = sink
         self._cpu_clock = cpu_clock
         self._cpu_ns = 0
-        self._cpu_last_ns = 0
+        self.processor_read_ns = 0
+        """What the clock of the loop's processor time showed when it was read last."""
         self._demand: Demand | None = None
         self._observer: ErrorObserver | None = None
         self._all_axes = (1 << len(axes)) - 1
@@ -307,13 +326,14 @@ class CyclicLoop:
         if was_open:
             # The loop has slept through its deadline: what it sends now comes too late for this SYNC.
             self._close(at_ns)
-            self._sent_ns = at_ns + 1
+            self._sent_ns = at_ns + _UNSENT_NS
         if self.cycle >= 0:
             self._account(at_ns)
             self._is_taken = self._sent_ns <= at_ns
         deviation_ns = at_ns - self._sync_due_ns
         lost = (deviation_ns + self.period_ns // 2) // self.period_ns
         if lost > 0:
+            self._tell_late(LateKind.OVERRUN, self._sync_due_ns, self._sync_due_ns + self.period_ns // 2, at_ns)
             self._sync_due_ns += lost * self.period_ns
             self._flags = int(SampleFlag.OVERRUN)
             self._lose_syncs(lost, at_ns)
@@ -352,6 +372,8 @@ class CyclicLoop:
         """The host has handed all frames to the bus at this time."""
         if self._is_closed:
             self._sent_ns = now_ns
+        elif self.late_listener is not None:
+            self.late_listener.demand_is_out(now_ns)
 
     def note(self, flag: int) -> None:
         """Something that the host has noticed in this cycle: a ``SampleFlag``."""
@@ -403,6 +425,8 @@ class CyclicLoop:
             # Lost cycles are not made up for: two SYNCs at once would be worse for the drives than a gap.
             self._flags |= int(SampleFlag.OVERRUN)
             lost = lateness_ns // self.period_ns
+            due_ns = self._sync_due_ns
+            self._tell_late(LateKind.OVERRUN, due_ns, due_ns + self.period_ns, now_ns)
             self._sync_due_ns += lost * self.period_ns
             self._lose_syncs(lost, now_ns)
         self._begin(now_ns, lateness_ns)
@@ -516,15 +540,24 @@ class CyclicLoop:
         elif reaction is Reaction.CONTROLLED_STOP:
             self.controlled_stop()
 
+    def _tell_late(self, kind: LateKind, sync_ns: int, deadline_ns: int, sent_ns: int | None) -> None:
+        if self.late_listener is not None:
+            tpdo_ns = None if self._flags & MISSED_TPDO_MASK else self._arrival_ns
+            deviation_ns = self._sync_deviation_ns
+            late = Late(kind, self.cycle, sync_ns, deadline_ns, sent_ns, self.is_paced, deviation_ns, tpdo_ns)
+            self.late_listener.missed(late)
+
     def _account(self, deadline_ns: int) -> None:
         """Hand on the sample of the cycle that ends with SYNC; ``deadline_ns`` is that of its demand."""
         if self._cpu_clock is not None:
             cpu_ns = self._cpu_clock()
-            self._cpu_ns = cpu_ns - self._cpu_last_ns if self._cpu_last_ns else 0
-            self._cpu_last_ns = cpu_ns
+            self._cpu_ns = cpu_ns - self.processor_read_ns if self.processor_read_ns else 0
+            self.processor_read_ns = cpu_ns
         lead_ns = deadline_ns - self._sent_ns
         if lead_ns < 0:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
+            sent_ns = None if lead_ns == -_UNSENT_NS else self._sent_ns
+            self._tell_late(LateKind.RPDO_DEADLINE, self._sync_ns, deadline_ns, sent_ns)
             self.guard.hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
         elif not self.guard.is_quiet:
             self.guard.clear(Condition.MISSED_DEADLINE, 0)

@@ -20,6 +20,7 @@ from drivers.period_trim import PeriodTrim
 from drivers.ports import Port
 from drivers.sdo import SDO_RESPONSE_BASE
 from drivers.socketcan_port import SocketcanPort
+from gateway.cyclic.cycle import CyclicLoop, LateListener
 from gateway.record.sample import SampleFlag
 from gateway.running.core import GatewayCore
 
@@ -51,11 +52,35 @@ class SyncTimer(Protocol):
         ...
 
 
-class LateWatch(Protocol):
-    """Who wants to know about wakes, and why one was late."""
+class LateWatch(LateListener, Protocol):
+    """Who wants to know what the loop does with its time, and why something was late."""
 
-    def woke(self, cycle: int, lateness_ns: int) -> None:
-        """The loop woke so late for the cycle after number ``cycle``."""
+    def follow(self, loop: CyclicLoop, phase_ns: Callable[[], int]) -> None:
+        """This loop will be driven from now on; ``phase_ns`` tells when after SYNC it wakes."""
+        ...
+
+    def rests(self, now_ns: int, until_ns: int) -> None:
+        """The loop, which read its clock at ``now_ns``, sleeps until then."""
+        ...
+
+    def waits(self, now_ns: int, until_ns: int) -> None:
+        """The loop waits for frames, until then at the latest."""
+        ...
+
+    def woke(self, cycle: int, woke_ns: int) -> None:
+        """It has slept, and woke at this time for the cycle after number ``cycle``."""
+        ...
+
+    def roused(self, woke_ns: int) -> None:
+        """It has waited for frames, and goes on at this time."""
+        ...
+
+    def was_refused(self, span_ns: int) -> None:
+        """It has waited so long for a bus that was full."""
+        ...
+
+    def tell(self) -> None:
+        """A demand has just been sent, and nothing is urgent for some time."""
         ...
 
 
@@ -101,6 +126,9 @@ class CycleHost:
         """When after SYNC the loop wakes; 0 while it is not known."""
         self._trim = PeriodTrim(core.loop.period_ns // 1000)
         core.loop.is_paced = sync is not None
+        if late is not None:
+            core.loop.late_listener = late
+            late.follow(core.loop, lambda: self.phase_ns)
 
     def run(self) -> None:
         """Drive the core until it is done. Raises BusError when the bus has gone."""
@@ -162,7 +190,7 @@ class CycleHost:
                 return
         if self._echo_cob_id is None or not loop.is_paced:
             loop.sent(self._clock())
-        elif any(frame.cob_id == self._echo_cob_id for frame in frames):
+        elif loop.is_closed and any(frame.cob_id == self._echo_cob_id for frame in frames):
             # Not before the bus says so.
             loop.sent(loop.sync_due_ns + loop.period_ns)
         self._switch_sync()
@@ -170,6 +198,8 @@ class CycleHost:
         # A loop that is always late never waits, and must hear of a stop all the same.
         self._polled_cycle = loop.cycle
         self._poll()
+        if self._late is not None and loop.is_closed:
+            self._late.tell()
 
     def _switch_sync(self) -> None:
         loop = self._core.loop
@@ -197,8 +227,11 @@ class CycleHost:
         if not loop.is_running or loop.cycle != self._polled_cycle:
             self._polled_cycle = loop.cycle
             self._poll()
+        late = self._late
         if self._backlog:
             self._wait(min(due_ns - now_ns, RETRY_NS))
+            if late is not None:
+                late.was_refused(self._clock() - now_ns)
             self._send([])
             return
         if loop.is_running:
@@ -208,13 +241,23 @@ class CycleHost:
             else:
                 target_ns = sync_ns + self.phase_ns if loop.is_paced else sync_ns
             target_ns = min(target_ns, due_ns)
-            if target_ns - now_ns > SHORTEST_SLEEP_NS:
+            # A SYNC that is overdue may come at any moment.
+            if target_ns - now_ns > SHORTEST_SLEEP_NS and not loop.missing_syncs:
+                if late is not None:
+                    late.rests(now_ns, target_ns)
                 self._sleep((target_ns - now_ns) * 1e-9)
-                self._lateness_ns = max(0, self._clock() - target_ns)
-                if self._late is not None:
-                    self._late.woke(loop.cycle, self._lateness_ns)
+                woke_ns = self._clock()
+                self._lateness_ns = max(0, woke_ns - target_ns)
+                if late is not None:
+                    late.woke(loop.cycle, woke_ns)
                 return
-        self._wait(min(due_ns - now_ns, MAX_WAIT_NS))
+        until_ns = min(due_ns, now_ns + MAX_WAIT_NS)
+        if late is None or not loop.is_running:
+            self._wait(until_ns - now_ns)
+            return
+        late.waits(now_ns, until_ns)
+        self._wait(until_ns - now_ns)
+        late.roused(self._clock())
 
     def _wait(self, span_ns: int) -> None:
         timeout_s = span_ns * 1e-9

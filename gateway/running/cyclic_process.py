@@ -39,9 +39,10 @@ from gateway.running.core import GatewayCore
 from gateway.running.cycle_bus import CycleBus, open_cycle_bus
 from gateway.running.cycle_host import CycleHost
 from gateway.running.event_text import describe
-from gateway.running.late_watch import LateWatch
+from gateway.running.late_account import LateAccountant, is_processor_clock_fine, open_counters
 from gateway.running.learning_store import LearningStore, open_store
 from gateway.running.preparation import plan
+from gateway.running.wake_trace import WakeTrace
 from mechanism.cam_file import parse_cam_file
 
 LISTENING_S: Final = 0.5
@@ -131,7 +132,7 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
     port.send(SYNC_FRAME)
 
 
-def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late: LateWatch | None = None) -> None:
+def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late: LateAccountant | None = None) -> None:
     """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
     try:
         CycleHost(
@@ -182,15 +183,24 @@ def keep_memory(store: LearningStore, core: GatewayCore, ring: RingWriter) -> Ga
     return None
 
 
-def late_watch(config: GatewayConfig, ring: RingWriter) -> LateWatch | None:
-    """Who tells, as events of the run, why cycles were late; None unless the configuration asks for it."""
-    if not config.bus.trace_lateness:
-        return None
+def late_accountant(config: GatewayConfig, bus: CycleBus, ring: RingWriter) -> LateAccountant:
+    """Who tells, as events of the run, why demands were late, and of late wakes where the configuration asks for it."""
+    period_ns = config.bus.cycle_us * 1000
 
-    def tell(text: str, figures: dict[str, int]) -> None:
+    def tell(at_ns: int, kind: str, text: str, data: dict[str, str | int | bool]) -> None:
+        ring.append_event(at_ns, kind, text, source="gateway", **data)
+
+    def trace(text: str, figures: dict[str, int]) -> None:
         ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)
 
-    return LateWatch(config.bus.cycle_us * 1000, tell)
+    return LateAccountant(
+        period_ns,
+        tell,
+        is_echoed=bus.echo_cob_id is not None,
+        is_fine=is_processor_clock_fine(),
+        counters=open_counters(),
+        trace=WakeTrace(period_ns, trace) if config.bus.trace_lateness else None,
+    )
 
 
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
@@ -239,7 +249,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     try:
         bus = join_bus(address, config, ring)
         ring.set_state(RunState.RUNNING)
-        run_guarded(core, bus, poll, late_watch(config, ring))
+        run_guarded(core, bus, poll, late_accountant(config, bus, ring))
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.running.late_watch import LateWatch, ThreadFigures, read_steal_ns, read_thread, read_waited_ns
+from gateway.running.wake_trace import ThreadFigures, WakeTrace, read_steal_ns, read_thread, read_waited_ns
 
 MS = 1_000_000
 
@@ -14,7 +14,7 @@ class Kernel:
         self.switches = self.minor = self.major = self.now_ns = self.stat_reads = 0
         self.steal = self.waited = 0
         self.told = []
-        self.watch = LateWatch(
+        self.watch = WakeTrace(
             MS,
             lambda text, figures: self.told.append((text, figures)),
             thread=lambda: ThreadFigures(self.switches, self.minor, self.major),
@@ -35,6 +35,7 @@ def test_a_loop_in_time_reads_no_file_and_says_nothing():
         kernel.now_ns += MS
         kernel.switches += 1
         kernel.watch.woke(cycle, 99_999)
+        kernel.watch.tell()
     kernel.watch.flush()
     assert kernel.told == []
     assert kernel.stat_reads == 0
@@ -46,6 +47,7 @@ def test_each_late_wake_is_given_what_changed_in_its_own_cycle():
     kernel.watch.woke(1, 0)
     kernel.switches += 2
     kernel.watch.woke(2, 400_000)
+    kernel.watch.tell()
     text, figures = kernel.told.pop()
     assert text == "1 late wakes, the worst 400 us at cycle 2: the processor taken away 2 times"
     assert figures["involuntary_switches"] == 2
@@ -54,9 +56,12 @@ def test_each_late_wake_is_given_what_changed_in_its_own_cycle():
     kernel.minor += 3
     kernel.watch.woke(4, 900_000)
     kernel.watch.woke(5, 120_000)
+    kernel.watch.tell()
     assert kernel.told == [], "a second has not passed"
     kernel.now_ns += 1000 * MS
     kernel.watch.woke(6, 0)
+    assert kernel.told == [], "not in the cycle itself"
+    kernel.watch.tell()
     text, figures = kernel.told.pop()
     assert text.startswith(
         "3 late wakes, the worst 900 us at cycle 4: 20 ms stolen by the host, 3 page faults, no cause"
@@ -71,6 +76,7 @@ def test_waiting_for_a_processor_explains_a_late_wake():
     kernel = Kernel()
     kernel.waited = 350_000
     kernel.watch.woke(9, 360_000)
+    kernel.watch.tell()
     text, figures = kernel.told.pop()
     assert text == "1 late wakes, the worst 360 us at cycle 9: 350 us of waiting for a processor"
     assert (figures["waited_us"], figures["unexplained"]) == (350, 0)

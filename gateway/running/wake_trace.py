@@ -1,7 +1,8 @@
-"""Why a cycle was late: what the kernel knows of the time that the loop did not have.
+"""Every late wake, whether a deadline was missed or not: what the kernel knows of the time that the loop did not have.
 
 One cheap read a cycle (the thread's own figures), two dear ones, of files in /proc, only after a late wake. What is
-found is collected, and told in a sentence at most once a second.
+found is collected, and told in a sentence at most once a second. Why deadlines were missed is kept by
+``gateway.running.late_account``, always; this is the closer look that ``bus.trace_lateness`` asks for.
 """
 
 import os
@@ -61,8 +62,8 @@ def read_waited_ns(path: Path = Path("/proc/thread-self/schedstat")) -> int | No
         return None
 
 
-class LateWatch:
-    """Notes late wakes and their causes; see ``gateway.running.cycle_host.LateWatch``."""
+class WakeTrace:
+    """Notes late wakes and their causes."""
 
     def __init__(
         self,
@@ -96,6 +97,9 @@ class LateWatch:
         if lateness_ns >= self._limit_ns:
             self._note(cycle, lateness_ns, now)
         self._before = now
+
+    def tell(self) -> None:
+        """Tell what has not been told yet, if it is time to."""
         if self._late and self._clock() - self._told_ns >= TELL_EVERY_NS:
             self.flush()
 
