@@ -218,6 +218,12 @@ class RecoverySection(Model):
 
     timeout_s: Annotated[float, Field(ge=0.0, le=60.0)] = 2.0
     """How long a drive that has gone may take to come back, to be commissioned anew; 0 leaves all as they are."""
+    bus_off_timeout_s: Annotated[float, Field(ge=0.05, le=60.0)] = 5.0
+    """How long the gateway's own controller may be bus-off before the bus is given up."""
+    restart_delay_ms: Annotated[int, Field(ge=1, le=10_000)] = 100
+    """After so long the gateway restarts its controller, where the interface's own restart-ms is 0."""
+    max_restarts: Annotated[int, Field(ge=0, le=100)] = 3
+    """In a run; 0 leaves the restart to the interface."""
 
 
 class EmulatorSection(Model):

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from drivers.controller import Controller
 from drivers.frame import Frame
 from drivers.python_can_port import PythonCanPort, open_socketcand
 from drivers.socketcan_port import SocketcanPort
@@ -19,8 +20,14 @@ _IFF_UP: Final = 1
 class Port(Protocol):
     """An open connection to one CAN bus, without blocking except in ``wait``."""
 
+    @property
+    def controller(self) -> Controller:
+        """What the interface tells of its own controller."""
+        ...
+
     def send(self, frame: Frame) -> bool:
-        """Give ``frame`` to the bus; False when its transmit queue is full, and the frame was not taken.
+        """Give ``frame`` to the bus; False when its transmit queue is full, or the controller bus-off, and the frame
+        was not taken.
 
         Raises:
             BusError: the bus has gone away.
@@ -33,7 +40,7 @@ class Port(Protocol):
         None may also mean that there was none a moment ago, when the queue was read; ``wait`` then ends at once.
 
         Raises:
-            BusError: the bus has gone away, or the controller has gone bus-off.
+            BusError: the bus has gone away.
         """
         ...
 

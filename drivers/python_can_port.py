@@ -3,6 +3,7 @@
 import logging
 import select
 import socket
+import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -10,21 +11,26 @@ from typing import Any, Final
 import can
 
 from drivers.arrival_clock import ArrivalClock
+from drivers.bus_off import Link
+from drivers.controller import Controller, ErrorState
 from drivers.errors import BusError
 from drivers.frame import Frame
+from drivers.python_can_controller import link_to, take_error_frame, told_state
 
 CONNECT_TIMEOUT_S: Final = 0.8
 """How long a socketcand server may take for each step of the greeting."""
 
 _MAX_SKIPPED_FRAMES: Final = 64
 _MAX_REPLY_BYTES: Final = 256
+_BUS_OFF_PAUSE_S: Final = 0.005
 
 
 class PythonCanPort:
     """Port on a python-can bus.
 
-    29-bit, CAN FD and error frames are skipped. ``filters`` are applied here rather than by the interface: some of them
-    cannot, and python-can then answers "nothing there" for a frame that it has filtered out.
+    29-bit and CAN FD frames are skipped, error frames told to ``controller``. ``filters`` are applied here rather than
+    by the interface: some of them cannot, and python-can then answers "nothing there" for a frame that it has filtered
+    out.
     """
 
     def __init__(
@@ -35,6 +41,9 @@ class PythonCanPort:
         filters: Sequence[tuple[int, int]] | None = None,
     ) -> None:
         """Take over the open ``bus``; ``interface`` and ``channel`` are for error messages."""
+        self.controller: Final = Controller()
+        self.link: Final[Link | None] = link_to(bus, interface, channel)
+        """What can restart the controller; None where this interface offers nothing."""
         self._bus = bus
         self._interface = interface
         self._channel = channel
@@ -70,6 +79,8 @@ class PythonCanPort:
         """See Port. Over socketcand a remote frame is dropped: the protocol has none."""
         if frame.is_remote and not self._carries_remote_frames:
             return True
+        if self.controller.is_off:
+            return False
         message = can.Message(
             arbitration_id=frame.cob_id, is_extended_id=False, is_remote_frame=frame.is_remote, data=frame.data
         )
@@ -79,8 +90,11 @@ class PythonCanPort:
             # python-can has no error of its own for a full queue; what failed for good shows on the next receive.
             if isinstance(error.__cause__, OSError):
                 raise self._error(error) from None
+            self._is_bus_off()
             return False
         except (can.CanError, OSError) as error:
+            if self._is_bus_off():
+                return False
             raise self._error(error) from None
         return True
 
@@ -92,7 +106,10 @@ class PythonCanPort:
                 self._clock.queue_is_empty()
                 self._may_hold_more = False
                 return None
-            if message.is_extended_id or message.is_error_frame or message.is_fd:
+            if message.is_error_frame:
+                take_error_frame(self.controller, self._bus, self._interface, message)
+                continue
+            if message.is_extended_id or message.is_fd:
                 continue
             cob_id = message.arbitration_id
             if self._filters is not None and not any(cob_id & mask == wanted for wanted, mask in self._filters):
@@ -112,6 +129,9 @@ class PythonCanPort:
             return self._wait_for_socket(self._socket, timeout_s)
         message = self._read(timeout_s)
         if message is None:
+            if self.controller.is_off:
+                # Such an interface answers at once, and would be asked again at once.
+                time.sleep(min(timeout_s, _BUS_OFF_PAUSE_S))
             return False
         self._read_ahead.append(message)
         return True
@@ -135,7 +155,15 @@ class PythonCanPort:
         try:
             return self._bus.recv(timeout_s)
         except (can.CanError, OSError) as error:
+            if self._is_bus_off():
+                return None
             raise self._error(error) from None
+
+    def _is_bus_off(self) -> bool:
+        """Whether what has just failed has failed because the controller is bus-off."""
+        if told_state(self._bus, self._interface) is ErrorState.OFF:
+            self.controller.change(ErrorState.OFF)
+        return self.controller.is_off
 
     def _wait_for_socket(self, stream: socket.socket, timeout_s: float) -> bool:
         try:

@@ -7,10 +7,10 @@ import socket
 import struct
 import time
 from collections.abc import Sequence
-from enum import IntFlag
 from typing import Final
 
 from drivers.arrival_clock import ArrivalClock
+from drivers.controller import Controller
 from drivers.errors import BusError
 from drivers.frame import MAX_DATA_LENGTH, Frame
 from drivers.message_batch import MessageBatch
@@ -41,26 +41,12 @@ _MAX_SKIPPED_FRAMES: Final = 64
 _QUEUE_FULL: Final = (errno.ENOBUFS, errno.EAGAIN)
 
 
-class BusErrorClass(IntFlag):
-    """What an error frame reports (linux/can/error.h)."""
-
-    TRANSMIT_TIMEOUT = 0x001
-    LOST_ARBITRATION = 0x002
-    CONTROLLER = 0x004
-    PROTOCOL = 0x008
-    TRANSCEIVER = 0x010
-    NO_ACKNOWLEDGE = 0x020
-    BUS_OFF = 0x040
-    BUS_ERROR = 0x080
-    RESTARTED = 0x100
-    COUNTERS = 0x200
-
-
 class SocketcanPort:
     """Port on a SocketCAN network interface.
 
-    Frames of 29-bit identifiers are left in the kernel: CANopen has none. ``error_counts`` counts the error frames by
-    what they report, ``lost_frame_count`` the frames that the kernel had no room for; bus-off raises BusError.
+    Frames of 29-bit identifiers are left in the kernel: CANopen has none. ``controller`` is what the error frames tell
+    of the own controller; while it is bus-off nothing can be sent. ``lost_frame_count`` counts the frames that the
+    kernel had no room for.
     """
 
     def __init__(
@@ -79,9 +65,7 @@ class SocketcanPort:
             BusError: this kernel has no SocketCAN, there is no such interface, or it is down.
         """
         self.channel: Final = channel
-        self.error_counts: Final = dict.fromkeys(BusErrorClass, 0)
-        self.error_frame_count = 0
-        """Error frames, whatever they reported."""
+        self.controller: Final = Controller()
         self._socket = self._open(channel, filters) if carrier is None else carrier
         if hears_own:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_RECV_OWN_MSGS, 1)
@@ -135,6 +119,9 @@ class SocketcanPort:
 
     def send(self, frame: Frame) -> bool:
         """See Port."""
+        if self.controller.is_off:
+            # The kernel would take it, and either drop it or keep it until the controller is back: too late for all.
+            return False
         cob_id, data, is_remote = frame
         try:
             self._socket.send(_pack_frame(cob_id | _CAN_RTR_FLAG if is_remote else cob_id, len(data), data))
@@ -158,7 +145,7 @@ class SocketcanPort:
                 # Most frames by far are whole and plain.
                 frame = Frame(identifier, data if length == MAX_DATA_LENGTH else data[:length])
             elif identifier & _CAN_ERR_FLAG:
-                self._count_error(identifier)
+                self.controller.take(identifier, data[:length])
                 continue
             else:
                 frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
@@ -200,14 +187,6 @@ class SocketcanPort:
     def close(self) -> None:
         """See Port."""
         self._socket.close()
-
-    def _count_error(self, identifier: int) -> None:
-        self.error_frame_count += 1
-        for error_class in BusErrorClass:
-            if identifier & error_class:
-                self.error_counts[error_class] += 1
-        if identifier & BusErrorClass.BUS_OFF:
-            raise self._error("the controller has gone bus-off; look at bit rate, wiring and termination")
 
     def _lost(self, error: OSError) -> BusError:
         if error.errno == errno.ENETDOWN:

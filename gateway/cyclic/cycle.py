@@ -120,6 +120,7 @@ class CyclicLoop:
         "_in_force",
         "_is_closed",
         "_is_coupled_stop_due",
+        "_is_lost",
         "_is_taken",
         "_no_torque_offsets",
         "_no_velocities",
@@ -138,6 +139,7 @@ class CyclicLoop:
         "cycle",
         "guard",
         "is_guarding_enabled",
+        "is_off_bus",
         "is_paced",
         "is_running",
         "late_listener",
@@ -176,6 +178,8 @@ class CyclicLoop:
         self.is_running = False
         self.is_paced = False
         """SYNC is sent by somebody else, the kernel, and seen by ``receive_sync``; set before ``start``."""
+        self.is_off_bus = False
+        """The own controller is bus-off: the cycle goes on, but what it hands out is lost."""
         self.missing_syncs = 0
         """SYNCs in a row that were due and not seen."""
         self.actuals_are_valid = False
@@ -214,6 +218,8 @@ class CyclicLoop:
         self._is_closed = True
         self._is_taken = True
         """The demand sent last was on the bus before the SYNC that came last, so that the drives apply it."""
+        self._is_lost = False
+        """The demand that was made last has not gone onto the bus, and will not."""
         self._arrival_ns = 0
         self._sent_ns = 0
         self._flags = 0
@@ -239,6 +245,19 @@ class CyclicLoop:
     def stop(self) -> None:
         """No further SYNC."""
         self.is_running = False
+
+    def leave_bus(self) -> None:
+        """The own controller has gone bus-off: no drive sees a SYNC, or takes a demand, until ``rejoin_bus``.
+
+        The demand stands still meanwhile, so that it goes on from where the drives have been left. SYNC is the loop's
+        own business from now on: a timer's, sent at once after the return, would take over what is then still stale.
+        """
+        self.is_off_bus = True
+        self.is_paced = False
+
+    def rejoin_bus(self) -> None:
+        """The own controller is back; the next SYNC is seen again, the next demand taken."""
+        self.is_off_bus = False
 
     def follow(self, demand: Demand | None, observer: ErrorObserver | None = None) -> None:
         """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions.
@@ -375,6 +394,14 @@ class CyclicLoop:
         elif self.late_listener is not None:
             self.late_listener.demand_is_out(now_ns)
 
+    def lost(self) -> None:
+        """What was in the outbox has been thrown away: it could not be put on the bus."""
+        self._is_lost = True
+        self._is_taken = False
+        self._flags |= SampleFlag.SEND_BUFFER_FULL | SampleFlag.BUS_ERROR
+        if self._is_closed:
+            self._sent_ns = self._sync_due_ns + self.period_ns
+
     def note(self, flag: int) -> None:
         """Something that the host has noticed in this cycle: a ``SampleFlag``."""
         self._flags |= flag
@@ -417,7 +444,7 @@ class CyclicLoop:
             self._account(self._sync_due_ns)
         self.outbox.append(SYNC_FRAME)
         self._flags = 0
-        self._is_taken = True
+        self._is_taken = not self._is_lost
         if self.missing_syncs:
             self._flags = int(SampleFlag.SYNC_LOST)
             self.missing_syncs = 0
@@ -460,7 +487,7 @@ class CyclicLoop:
             self._check(now_ns)
         if self._observer is not None and not self._awaited:
             self._show_errors(self._observer)
-        if self._is_coupled_stop_due:
+        if self._is_coupled_stop_due and not (self.is_off_bus or self._is_lost):
             self._begin_coupled_stop()
         demand = self._demand
         if demand is None:
@@ -484,6 +511,7 @@ class CyclicLoop:
                 demand.phase,
             )
         _, _, _, targets, torque_offsets, _ = self._sent
+        self._is_lost = False
         outbox = self.outbox
         for number, axis in enumerate(self.axes):
             axis.target = targets[number]

@@ -88,7 +88,8 @@ class GuardTripped(Event):
     ``axis`` is the axis' name, empty where the condition is not one axis'. ``value`` and ``limit`` are in the
     condition's own unit: counts for following error, cam window and frozen actual value, counts a cycle for the
     velocity, per mille of rated torque, micrometres for the end effector, cycles (in a row) for whatever is missed, ms
-    for the heartbeat; the emergency error code or the statusword, with limit 0, for what has none.
+    for the heartbeat; the emergency error code or the statusword, with limit 0, for what has none. Bus-off has limit 0
+    where the own controller has told it, else the cycles in which no drive was heard.
     """
 
     condition: Condition
@@ -148,6 +149,12 @@ class Guard:
         """``hold`` for a condition that has no value but for how many cycles it has held."""
         cycles = self._persistence[condition]
         self.hold(condition, axis, cycles, cycles, now_ns)
+
+    def trip(self, condition: Condition, axis: int, value: int, limit: int, now_ns: int) -> None:
+        """``hold`` for what is certain at once, however long the condition would otherwise have to last."""
+        counts = self._counts[condition]
+        counts[axis] = max(counts[axis], self._persistence[condition] - 1)
+        self.hold(condition, axis, value, limit, now_ns)
 
     def hold(self, condition: Condition, axis: int, value: int, limit: int, now_ns: int) -> None:
         """The condition holds in this cycle; ``axis`` 0 is used where it is not one axis'."""

@@ -28,6 +28,10 @@ class SdoPacing:
         """Whether requests wait for a later cycle."""
         return bool(self._waiting)
 
+    def forget(self) -> None:
+        """Drop what waits: nobody can be asked any more."""
+        self._waiting.clear()
+
     def release(self, frames: list[Frame], cycle: int | None) -> list[Frame]:
         """What may go now: of ``frames``, and of what was held back before; ``cycle`` None: no cycle runs."""
         if cycle is None:

@@ -138,6 +138,7 @@ def build_core(
         is_homing_again,
         approach,
         config.recovery.timeout_s,
+        config.recovery.bus_off_timeout_s,
     )
     return GatewayCore(session, Operation(demand, operation_limits(config)), config.bus.sdo_frames_a_cycle)
 

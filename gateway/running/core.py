@@ -3,6 +3,7 @@
 It implements ``drivers.node.Node``; the virtual-time and the real-time host drive the same object.
 """
 
+from drivers.controller import ControllerChanged, ErrorState
 from drivers.frame import Frame
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged, Procedure
 from drivers.nmt import SYNC_COB_ID, NmtState
@@ -12,6 +13,7 @@ from gateway.cyclic.operation import Operation, Order, OrderAnswered
 from gateway.cyclic.sdo_pacing import SdoPacing
 from gateway.errors import CommissioningError
 from gateway.learning.law import LearnedTorque
+from gateway.running.bus_presence import BusOffError
 from gateway.running.machine_session import MachineSession, OperatorStopError
 
 
@@ -99,9 +101,13 @@ class GatewayCore:
             self._resume(now_ns)
 
     def take_frames(self) -> list[Frame]:
-        """Frames to send: the cycle's first, so that SDO traffic never delays a demand."""
+        """Frames to send: the cycle's first, so that SDO traffic never delays a demand. None while the controller is
+        bus-off: they would be stale when it is back.
+        """
         loop = self.loop
         frames = loop.outbox
+        if loop.is_off_bus:
+            return self._lose_frames()
         if frames:
             loop.outbox = []
         if self.master.outbox or self._sdo_pacing.is_holding:
@@ -144,6 +150,35 @@ class GatewayCore:
         self.session.is_stop_requested = True
         if self.loop.is_running:
             self.loop.quick_stop()
+
+    # -- the own controller --------------------------------------------------------------------------------------
+
+    def controller_changed(self, change: ControllerChanged) -> None:
+        """The host's CAN controller has another error state; bus-off is a condition of the guard's in any phase."""
+        loop = self.loop
+        self._events.append(change)
+        is_off = change.state is ErrorState.OFF
+        if self.is_done or is_off is loop.is_off_bus:
+            return
+        self.session.bus.note(is_off, change.at_ns)
+        if is_off:
+            loop.leave_bus()
+            self._guard.trip(Condition.BUS_OFF, 0, 0, 0, change.at_ns)
+        else:
+            loop.rejoin_bus()
+        self._resume(change.at_ns)
+
+    def tell(self, event: Event) -> None:
+        """Put something of the host's among the events of the run."""
+        self._events.append(event)
+
+    def _lose_frames(self) -> list[Frame]:
+        if self.loop.outbox:
+            self.loop.outbox = []
+            self.loop.lost()
+        self.master.outbox = []
+        self._sdo_pacing.forget()
+        return []
 
     # -- inside --------------------------------------------------------------------------------------------------
 
@@ -189,10 +224,14 @@ class GatewayCore:
             if answer is not None:
                 self._events.append(answer)
         if self._procedure is None:
+            # A procedure that has not begun could not be told why it is not to go on.
             self._procedure = self.session.run()
+            self._resume_at_ns = next(self._procedure)
         session = self.session
         try:
-            if self._lost and session.is_interruptible:
+            if session.bus.is_off and session.is_interruptible:
+                self._resume_at_ns = self._procedure.throw(BusOffError())
+            elif self._lost and session.is_interruptible:
                 self._resume_at_ns = self._procedure.throw(CommissioningError(self._lost))
             elif session.is_stop_requested and session.is_interruptible:
                 self._resume_at_ns = self._procedure.throw(OperatorStopError("stopped on request"))

@@ -13,15 +13,16 @@ import time
 from collections.abc import Callable
 from typing import Final, Protocol
 
+from drivers.controller import Controller
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.pdo import RPDO_BASE
 from drivers.period_trim import PeriodTrim
 from drivers.ports import Port
 from drivers.sdo import SDO_RESPONSE_BASE
-from drivers.socketcan_port import SocketcanPort
 from gateway.cyclic.cycle import CyclicLoop, LateListener
 from gateway.record.sample import SampleFlag
+from gateway.running.controller_watch import ControllerWatch
 from gateway.running.core import GatewayCore
 
 MAX_WAIT_NS: Final = 50_000_000
@@ -96,6 +97,7 @@ class CycleHost:
         service: Port | None = None,
         sync: SyncTimer | None = None,
         late: LateWatch | None = None,
+        controller: ControllerWatch | None = None,
         echo_cob_id: int | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
         sleep: Callable[[float], object] = time.sleep,
@@ -104,7 +106,8 @@ class CycleHost:
 
         ``sync`` sends SYNC, and ``cyclic`` then hears it; None leaves it to the loop. ``poll`` is called at least once
         a cycle. ``echo_cob_id``: the last frame of each demand, which ``cyclic`` hears when it has been on the bus;
-        None: what has been sent is taken to be on the bus.
+        None: what has been sent is taken to be on the bus. ``controller`` looks after the CAN controller of ``cyclic``;
+        None: nobody does.
         """
         self._echo_cob_id = echo_cob_id
         self._core = core
@@ -119,7 +122,8 @@ class CycleHost:
         self._latest_ns = clock()
         self._lateness_ns = 0
         self._backlog: list[Frame] = []
-        self._errors: SocketcanPort | None = cyclic if isinstance(cyclic, SocketcanPort) else None
+        self._controller = controller
+        self._errors = Controller() if controller is None else controller.controller
         self._error_count = 0
         self._polled_cycle: int = -1
         self.phase_ns = 0
@@ -139,6 +143,8 @@ class CycleHost:
                 if self._service is not None:
                     self._drain(self._service)
                 now_ns = clock()
+                if self._errors.is_restless and self._controller is not None:
+                    self._look_after_controller(self._controller, now_ns)
                 due_ns = core.next_wake_ns()
                 if due_ns is not None and due_ns > now_ns:
                     self._rest(now_ns, due_ns)
@@ -201,6 +207,15 @@ class CycleHost:
         if self._late is not None and loop.is_closed:
             self._late.tell()
 
+    def _look_after_controller(self, controller: ControllerWatch, now_ns: int) -> None:
+        loop = self._core.loop
+        self._latest_ns = max(self._latest_ns, now_ns)
+        controller.look(self._latest_ns)
+        if loop.is_off_bus:
+            # What could not go before is as stale as all else; and the kernel is not to send SYNC after the return.
+            self._backlog = []
+            self._switch_sync()
+
     def _switch_sync(self) -> None:
         loop = self._core.loop
         if self._sync is not None and self._is_sync_on is not (loop.is_running and loop.is_paced):
@@ -216,8 +231,8 @@ class CycleHost:
             away_ns = wanted_ns - self.phase_ns
             self.phase_ns += away_ns >> PHASE_RISE if away_ns > 0 else -(-away_ns >> PHASE_FALL)
             self.phase_ns = min(self.phase_ns, loop.period_ns // 2)
-        if self._errors is not None and self._errors.error_frame_count != self._error_count:
-            self._error_count = self._errors.error_frame_count
+        if self._errors.frame_count != self._error_count:
+            self._error_count = self._errors.frame_count
             loop.note(SampleFlag.BUS_ERROR)
 
     def _rest(self, now_ns: int, due_ns: int) -> None:

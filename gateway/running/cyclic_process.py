@@ -18,6 +18,7 @@ from typing import Final
 from config.bus_budget import deadline_without_wire_us
 from config.loading import parse_config
 from config.schema import GatewayConfig
+from drivers.bus_off import Restarter, RestartSettings
 from drivers.cia402 import COMMAND_QUICK_STOP
 from drivers.errors import BusError, DriveError
 from drivers.frame import Frame
@@ -35,6 +36,7 @@ from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
 from gateway.running.bus_budget import has_wire
 from gateway.running.child_process import end_with
+from gateway.running.controller_watch import ControllerWatch
 from gateway.running.core import GatewayCore
 from gateway.running.cycle_bus import CycleBus, open_cycle_bus
 from gateway.running.cycle_host import CycleHost
@@ -132,11 +134,29 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
     port.send(SYNC_FRAME)
 
 
-def run_guarded(core: GatewayCore, bus: CycleBus, poll: Callable[[], None], late: LateAccountant | None = None) -> None:
-    """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told."""
+def run_guarded(
+    core: GatewayCore,
+    bus: CycleBus,
+    poll: Callable[[], None],
+    late: LateAccountant | None = None,
+    restart: RestartSettings | None = None,
+) -> None:
+    """Run the core by the real clock; a failure of our own, once the cycle runs, stops the drives before it is told.
+
+    ``restart``: how the own controller is brought back after bus-off.
+    """
+    controller = bus.cyclic.controller
+    restarter = Restarter(controller, bus.link, restart or RestartSettings())
     try:
         CycleHost(
-            core, bus.cyclic, poll, service=bus.service, sync=bus.sync, late=late, echo_cob_id=bus.echo_cob_id
+            core,
+            bus.cyclic,
+            poll,
+            service=bus.service,
+            sync=bus.sync,
+            late=late,
+            controller=ControllerWatch(controller, restarter, core),
+            echo_cob_id=bus.echo_cob_id,
         ).run()
     except BusError:
         raise
@@ -249,7 +269,9 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     try:
         bus = join_bus(address, config, ring)
         ring.set_state(RunState.RUNNING)
-        run_guarded(core, bus, poll, late_accountant(config, bus, ring))
+        recovery = config.recovery
+        restart = RestartSettings(recovery.restart_delay_ms * 1e-3, recovery.max_restarts)
+        run_guarded(core, bus, poll, late_accountant(config, bus, ring), restart)
         stopped_by = core.stopped_by
         failure: Exception | None = core.failure
     except BusError as error:

@@ -5,11 +5,13 @@ from dataclasses import fields
 from enum import Enum
 from typing import Final
 
+from drivers.controller import ControllerChanged, ErrorState
 from drivers.master import BootUpReceived, EmergencyReceived, HeartbeatLost, NodeStateChanged
 from drivers.node import Event
 from gateway.cyclic.guard import Condition, GuardTripped
 from gateway.cyclic.operation import OrderAnswered
 from gateway.running.commissioning import BootUpMissing
+from gateway.running.controller_watch import RestartTold
 from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
 
@@ -41,6 +43,8 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return "heartbeat_lost", f"node {node_id}: no heartbeat for {timeout_s:g} s", {"node_id": node_id}
         case BootUpReceived(_, node_id):
             return "boot_up", f"node {node_id} has booted up", {"node_id": node_id}
+        case ControllerChanged() | RestartTold():
+            return _describe_controller(event)
         case AxisRecovered(_, axis, is_ready, is_commissioned_anew, said):
             return (
                 "recovery",
@@ -60,6 +64,16 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return _describe_other(event)
 
 
+def _describe_controller(event: ControllerChanged | RestartTold) -> tuple[str, str, EventData]:
+    if isinstance(event, RestartTold):
+        return "controller", f"the gateway's CAN controller: {event.text}", {}
+    text = f"the gateway's CAN controller is {event.state.value}"
+    if event.state is not ErrorState.OFF:
+        text += f", {event.transmit_errors} transmit errors, {event.receive_errors} receive errors"
+    counters = {"transmit_errors": event.transmit_errors, "receive_errors": event.receive_errors}
+    return "controller", text, {"state": event.state.value, **counters}
+
+
 def _guarded_value(condition: Condition, value: int, limit: int) -> str:
     unit = _UNITS.get(condition)
     if unit is not None:
@@ -73,6 +87,8 @@ def _guarded_value(condition: Condition, value: int, limit: int) -> str:
             return f"statusword {value:04X}h"
         case Condition.HEARTBEAT_LOST:
             return f"silent for {limit} ms, or restarted"
+        case Condition.BUS_OFF if limit == 0:
+            return "the gateway's own controller has left the bus"
         case Condition.OPERATOR_STOP | Condition.SIGINT | Condition.SIGTERM:
             return "on request"
         case _:

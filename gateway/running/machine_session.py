@@ -20,6 +20,7 @@ from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.guard import Guard, StopReason
 from gateway.errors import CommissioningError, GatewayError
 from gateway.record.sample import Phase
+from gateway.running.bus_presence import BusGivenUpError, BusPresence
 from gateway.running.commissioning import (
     NetworkSettings,
     NodeSettings,
@@ -81,11 +82,13 @@ class MachineSession:
         is_homing_again: bool = False,
         approach: Approach | None = None,
         recovery_timeout_s: float = 0.0,
+        bus_off_timeout_s: float = 5.0,
     ) -> None:
         """``is_homing_again``: home the axes where they stand even if their drives are homed already.
 
         ``approach``: how a machine that does not stand where the plan begins gets onto its cam; None refuses it.
         ``recovery_timeout_s``: how long a node may be away after a stop before it is given up; 0 recovers nothing.
+        ``bus_off_timeout_s``: how long the own controller may be bus-off before the bus is given up.
         """
         self.axes = axes
         self.network = network
@@ -96,6 +99,7 @@ class MachineSession:
         """Of the master; an approach replaces it by one from where it has ended."""
         self.guard = guard
         self.power = AxisPower(master, loop)
+        self.bus = BusPresence(master, bus_off_timeout_s)
         self.events: Final[list[Event]] = []
         """What has happened, until the core hands it out; the list is never replaced."""
         self.failure: Exception | None = None
@@ -132,6 +136,15 @@ class MachineSession:
             self.failure = error
             self.stopped_by = self.guard.stopped_by or StopReason.COMMISSIONING
         self.is_interruptible = False
+        try:
+            # What is told to nobody disables no drive; and where they are is not known either.
+            yield from self.bus.wait()
+        except BusGivenUpError as error:
+            self.failure = error
+            self.stopped_by = StopReason.BUS_LOST
+            self.loop.stop()
+            self._step("done")
+            return
         yield from self._shut_down()
 
     def _axis(self, node: NodeSettings) -> AxisSetup:
@@ -229,7 +242,7 @@ class MachineSession:
             demand.begin(self.plan, [axis.channel.target for axis in self.axes])
             loop.follow(demand, demand.observer)
             self.is_following = True
-            while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
+            while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
                 if self.is_stop_requested:
                     loop.controlled_stop()
                 yield self.master.now_ns + NS_PER_S
@@ -256,7 +269,7 @@ class MachineSession:
         loop, demand = self.loop, approach.demand
         demand.begin(self._way, [axis.channel.target for axis in self.axes])
         loop.follow(demand)
-        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP):
+        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
             if self.is_stop_requested:
                 loop.controlled_stop()
             yield self.master.now_ns + NS_PER_S

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.broadcast_manager import PeriodicFrame
+from drivers.controller import BusErrorClass, ErrorState
 from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.message_batch import MessageBatch
-from drivers.socketcan_port import CAN_FRAME, BusErrorClass, SocketcanPort
+from drivers.socketcan_port import CAN_FRAME, SocketcanPort
 
 SO_TIMESTAMPNS = 35
 
@@ -79,11 +80,27 @@ def test_error_and_remote_frames_are_told_apart(pair):
     far.send(raw(0x20000000 | BusErrorClass.NO_ACKNOWLEDGE | BusErrorClass.BUS_ERROR, bytes(8)))
     far.send(raw(0x40000000 | 0x701))
     assert received(port) == Frame(0x701, b"", True)
-    assert port.error_frame_count == 1
-    assert port.error_counts[BusErrorClass.NO_ACKNOWLEDGE] == 1
+    assert port.controller.frame_count == 1
+    assert port.controller.counts[BusErrorClass.NO_ACKNOWLEDGE] == 1
+
+
+def test_a_port_that_is_bus_off_stays_open_and_sends_nothing_until_it_is_back(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    assert port.send(Frame(0x201, b"before"))
     far.send(raw(0x20000000 | BusErrorClass.BUS_OFF, bytes(8)))
-    with pytest.raises(BusError, match="bus-off"):
-        received(port)
+    far.send(raw(0x181))
+    assert received(port) == Frame(0x181)
+    assert port.controller.state is ErrorState.OFF
+    assert not port.send(Frame(0x202, b"lost"))
+    far.send(raw(0x20000000 | BusErrorClass.RESTARTED, bytes(8)))
+    assert received(port) is None
+    assert port.controller.state is ErrorState.ACTIVE
+    assert port.send(Frame(0x203, b"after"))
+    far.setblocking(False)
+    assert [far.recv(16)[:2] for _ in range(2)] == [b"\x01\x02", b"\x03\x02"]
+    with pytest.raises(BlockingIOError):
+        far.recv(16)
 
 
 def test_a_socket_without_stamps_says_so_with_zero():

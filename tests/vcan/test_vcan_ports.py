@@ -13,12 +13,14 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
+from drivers.can_link import LinkState, NetworkLink
+from drivers.controller import BusErrorClass, ErrorState
 from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.node import Event
 from drivers.ports import Port, interface_is_up, open_port
 from drivers.real_time import run_node
-from drivers.socketcan_port import BusErrorClass, SocketcanPort
+from drivers.socketcan_port import SocketcanPort
 
 pytestmark = [
     pytest.mark.vcan,
@@ -119,20 +121,33 @@ def test_the_kernel_applies_the_filters(raw: socket.socket) -> None:
         port.close()
 
 
-def test_error_frames_are_counted_and_bus_off_is_a_lost_bus(port: SocketcanPort, raw: socket.socket) -> None:
+def test_error_frames_are_counted_and_bus_off_lasts_until_the_restart(port: SocketcanPort, raw: socket.socket) -> None:
     error_passive = RAW.pack(CAN_ERR_FLAG | BusErrorClass.CONTROLLER | BusErrorClass.NO_ACKNOWLEDGE, 8, b"\0\x20")
     raw.send(error_passive)
     raw.send(error_passive)
     raw.send(RAW.pack(0x081, 0, b""))
     assert next_frame(port)[0] == Frame(0x081)
-    assert port.error_counts[BusErrorClass.CONTROLLER] == 2
-    assert port.error_counts[BusErrorClass.NO_ACKNOWLEDGE] == 2
-    assert port.error_counts[BusErrorClass.BUS_OFF] == 0
-    assert port.receive() is None
+    assert port.controller.counts[BusErrorClass.CONTROLLER] == 2
+    assert port.controller.counts[BusErrorClass.NO_ACKNOWLEDGE] == 2
+    assert port.controller.counts[BusErrorClass.BUS_OFF] == 0
+    assert port.controller.state is ErrorState.PASSIVE
     raw.send(RAW.pack(CAN_ERR_FLAG | BusErrorClass.BUS_OFF, 8, b""))
-    assert port.wait(PATIENCE_S)
-    with pytest.raises(BusError, match="socketcan:vcan0: the controller has gone bus-off"):
-        port.receive()
+    raw.send(RAW.pack(0x082, 0, b""))
+    assert next_frame(port)[0] == Frame(0x082)
+    assert not port.send(SYNC), "bus-off"
+    raw.send(RAW.pack(CAN_ERR_FLAG | BusErrorClass.RESTARTED, 8, b""))
+    raw.send(RAW.pack(0x083, 0, b""))
+    assert next_frame(port)[0] == Frame(0x083)
+    assert port.send(SYNC)
+
+
+def test_the_kernel_tells_of_a_virtual_interface_that_it_has_no_controller() -> None:
+    link = NetworkLink("vcan0")
+    assert link.read() == LinkState(None, None)
+    with pytest.raises(BusError, match="socketcan:vcan0: it has no controller that could be restarted"):
+        link.restart()
+    with pytest.raises(BusError, match="socketcan:vcan99: no such interface"):
+        NetworkLink("vcan99").read()
 
 
 def test_a_full_queue_is_a_result_and_not_an_error() -> None:
