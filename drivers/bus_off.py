@@ -3,12 +3,14 @@
 Without I/O but for the link that it is given, and the time.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 from drivers.can_link import LinkState
 from drivers.controller import Controller
 from drivers.errors import BusError
+from drivers.frame import Frame
 
 NS_PER_S: Final = 1_000_000_000
 LOOK_NS: Final = 50_000_000
@@ -50,6 +52,15 @@ class Restarter:
         self._look_ns = 0
         self._restart_ns: int | None = None
         self.restarts = 0
+
+    def losing(self, send: Callable[[Frame], bool]) -> Callable[[Frame], bool]:
+        """``send``, but for what would be sent while the controller is off: nobody is to send it later."""
+        controller = self._controller
+
+        def send_or_lose(frame: Frame) -> bool:
+            return controller.is_off or send(frame)
+
+        return send_or_lose
 
     def look(self, now_ns: int) -> list[str]:
         """Do what is due at ``now_ns``; returns what there is to tell, in sentences."""

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from drivers.bus_off import Link
 from drivers.controller import Controller
 from drivers.frame import Frame
 from drivers.python_can_port import PythonCanPort, open_socketcand
@@ -20,9 +21,17 @@ _IFF_UP: Final = 1
 class Port(Protocol):
     """An open connection to one CAN bus, without blocking except in ``wait``."""
 
+    outlives_bus_off: bool
+    """A controller that goes bus-off is no lost bus: whoever sets this sees to it that it comes back."""
+
     @property
     def controller(self) -> Controller:
         """What the interface tells of its own controller."""
+        ...
+
+    @property
+    def link(self) -> Link | None:
+        """What can restart the controller; None where the interface offers nothing."""
         ...
 
     def send(self, frame: Frame) -> bool:
@@ -40,7 +49,7 @@ class Port(Protocol):
         None may also mean that there was none a moment ago, when the queue was read; ``wait`` then ends at once.
 
         Raises:
-            BusError: the bus has gone away.
+            BusError: the bus has gone away, or the controller has gone bus-off and nobody ``outlives_bus_off``.
         """
         ...
 

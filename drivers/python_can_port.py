@@ -43,7 +43,9 @@ class PythonCanPort:
         """Take over the open ``bus``; ``interface`` and ``channel`` are for error messages."""
         self.controller: Final = Controller()
         self.link: Final[Link | None] = link_to(bus, interface, channel)
-        """What can restart the controller; None where this interface offers nothing."""
+        """See Port."""
+        self.outlives_bus_off = False
+        """See Port."""
         self._bus = bus
         self._interface = interface
         self._channel = channel
@@ -108,6 +110,8 @@ class PythonCanPort:
                 return None
             if message.is_error_frame:
                 take_error_frame(self.controller, self._bus, self._interface, message)
+                if self.controller.is_off and not self.outlives_bus_off:
+                    raise BusError(self._interface, self._channel, "the controller has gone bus-off")
                 continue
             if message.is_extended_id or message.is_fd:
                 continue
@@ -163,7 +167,7 @@ class PythonCanPort:
         """Whether what has just failed has failed because the controller is bus-off."""
         if told_state(self._bus, self._interface) is ErrorState.OFF:
             self.controller.change(ErrorState.OFF)
-        return self.controller.is_off
+        return self.controller.is_off and self.outlives_bus_off
 
     def _wait_for_socket(self, stream: socket.socket, timeout_s: float) -> bool:
         try:

@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import logging
 import os
 import resource
 import time
@@ -11,6 +12,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Final
 
+from drivers.bus_off import Restarter
 from drivers.node import Event, Node
 from drivers.node_runner import NodeRunner, RunStatistics
 from drivers.ports import Port
@@ -27,6 +29,9 @@ _MCL_FUTURE: Final = 2
 _CAP_IPC_LOCK: Final = 14
 
 
+_log = logging.getLogger(__name__)
+
+
 def run_node(
     node: Node,
     port: Port,
@@ -34,19 +39,28 @@ def run_node(
     on_event: Callable[[Event], None] | None = None,
     clock: Callable[[], int] = time.monotonic_ns,
     on_wake: Callable[[int, int], None] | None = None,
+    restarter: Restarter | None = None,
 ) -> RunStatistics:
     """Drive ``node`` on ``port`` until ``stop()``, which is asked on every pass and at least every ``MAX_WAIT_S``.
 
     Deadlines are absolute and wakes are handed over with the time they were due (see NodeRunner); ``clock`` is the
     clock that ``port`` gives arrivals in. ``on_event`` gets the node's events, ``on_wake(due_ns, now_ns)`` tells how
-    late a wake was.
+    late a wake was. With a ``restarter`` a controller that goes bus-off comes back, as that says; meanwhile frames are
+    lost.
 
     Raises:
-        BusError: the bus has gone away.
+        BusError: the bus has gone away; without a ``restarter`` also when the controller has gone bus-off.
         LivelockError: the node does not let the time go on.
     """
-    runner = NodeRunner(node, port.send, clock(), on_event, on_wake)
+    transmit = port.send
+    if restarter is not None:
+        port.outlives_bus_off = True
+        transmit = restarter.losing(port.send)
+    runner = NodeRunner(node, transmit, clock(), on_event, on_wake)
     while not stop():
+        if restarter is not None:
+            for text in restarter.look(clock()):
+                _log.warning("the CAN controller is bus-off: %s", text)
         # Read before the queue is emptied: every frame older than this instant is then handed over before its wakes.
         now_ns = clock()
         for _ in range(MAX_FRAMES_PER_PASS):

@@ -10,6 +10,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from drivers.arrival_clock import ArrivalClock
+from drivers.bus_off import Link
+from drivers.can_link import NetworkLink
 from drivers.controller import Controller
 from drivers.errors import BusError
 from drivers.frame import MAX_DATA_LENGTH, Frame
@@ -66,6 +68,10 @@ class SocketcanPort:
         """
         self.channel: Final = channel
         self.controller: Final = Controller()
+        self.link: Final[Link | None] = NetworkLink(channel) if carrier is None else None
+        """See Port."""
+        self.outlives_bus_off = False
+        """See Port."""
         self._socket = self._open(channel, filters) if carrier is None else carrier
         if hears_own:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_RECV_OWN_MSGS, 1)
@@ -145,7 +151,7 @@ class SocketcanPort:
                 # Most frames by far are whole and plain.
                 frame = Frame(identifier, data if length == MAX_DATA_LENGTH else data[:length])
             elif identifier & _CAN_ERR_FLAG:
-                self.controller.take(identifier, data[:length])
+                self._take_error(identifier, data[:length])
                 continue
             else:
                 frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
@@ -187,6 +193,11 @@ class SocketcanPort:
     def close(self) -> None:
         """See Port."""
         self._socket.close()
+
+    def _take_error(self, identifier: int, data: bytes) -> None:
+        self.controller.take(identifier, data)
+        if self.controller.is_off and not self.outlives_bus_off:
+            raise self._error("the controller has gone bus-off; look at bit rate, wiring and termination")
 
     def _lost(self, error: OSError) -> BusError:
         if error.errno == errno.ENETDOWN:

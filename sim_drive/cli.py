@@ -17,6 +17,7 @@ import typer
 from config.loading import SHIPPED, ConfigError, load_config
 from config.quirks import Quirk
 from config.schema import BusSection, GatewayConfig
+from drivers.bus_off import Restarter, RestartSettings
 from drivers.eds import read_eds_text
 from drivers.errors import BusError, DriveError
 from drivers.nmt import MAX_NODE_ID
@@ -230,7 +231,8 @@ def sim_drive(
         try:
             machine = build()
             announcement.make(fleet.name, place)
-            statistics = run_node(machine, bus, until(), on_event)
+            restarter = Restarter(bus.controller, bus.link, RestartSettings())
+            statistics = run_node(machine, bus, until(), on_event, restarter=restarter)
         finally:
             bus.close()
     else:

@@ -5,13 +5,10 @@ from typing import Final
 
 from config.schema import GatewayConfig, SyncSource
 from drivers.broadcast_manager import PeriodicFrame
-from drivers.bus_off import Link
-from drivers.can_link import NetworkLink
 from drivers.errors import BusError
 from drivers.nmt import EMCY_BASE, HEARTBEAT_BASE, SYNC_COB_ID
 from drivers.pdo import RPDO_BASE, TPDO_BASE
 from drivers.ports import Port
-from drivers.python_can_port import PythonCanPort
 from drivers.real_time import RealTimeFeature, RealTimeSetting
 from drivers.sdo import SDO_RESPONSE_BASE
 from drivers.socketcan_port import SocketcanPort
@@ -33,8 +30,6 @@ class CycleBus:
     sync: PeriodicFrame | None
     """The kernel's SYNC; None where the loop sends it."""
     sync_setting: RealTimeSetting
-    link: Link | None = None
-    """What can restart the controller of ``cyclic``."""
     echo_cob_id: int | None = None
     """Of the last demand of a cycle, where ``cyclic`` hears it when it has been on the bus."""
 
@@ -58,9 +53,8 @@ def open_cycle_bus(address: BusAddress, config: GatewayConfig, listener: Port) -
             raise GatewayError(
                 f"bus.sync_source: kernel needs the interface socketcan, this bus is {address} (auto or loop)"
             )
-        setting = _loop_setting(f"{address.interface} has no timer of its own")
-        link = listener.link if isinstance(listener, PythonCanPort) else None
-        return CycleBus(listener, None, None, setting, link)
+        listener.outlives_bus_off = True
+        return CycleBus(listener, None, None, _loop_setting(f"{address.interface} has no timer of its own"))
     sync, setting = _sync_timer(address, config)
     node_ids = [axis.node_id for axis in config.ordered_axes]
     tpdos = [TPDO_BASE[0] + node_id for node_id in node_ids]
@@ -72,7 +66,8 @@ def open_cycle_bus(address: BusAddress, config: GatewayConfig, listener: Port) -
         cyclic = SocketcanPort(address.channel, _exactly([SYNC_COB_ID, echo, *tpdos]), hears_own=True)
     bases = (EMCY_BASE, SDO_RESPONSE_BASE, HEARTBEAT_BASE)
     service = address.open(_exactly([base + node_id for node_id in node_ids for base in bases]))
-    return CycleBus(cyclic, service, sync, setting, NetworkLink(address.channel), echo)
+    cyclic.outlives_bus_off = service.outlives_bus_off = True
+    return CycleBus(cyclic, service, sync, setting, echo)
 
 
 def _sync_timer(address: BusAddress, config: GatewayConfig) -> tuple[PeriodicFrame | None, RealTimeSetting]:

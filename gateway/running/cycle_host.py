@@ -174,7 +174,7 @@ class CycleHost:
             core.receive(frame, self._latest_ns)
             if frame.cob_id == SYNC_COB_ID:
                 core.loop.woke(self._lateness_ns)
-                if self._sync is not None and self._trim.observe(core.loop.sync_period_ns):
+                if self._sync is not None and self._is_sync_on and self._trim.observe(core.loop.sync_period_ns):
                     self._sync.retime(self._trim.interval_us)
             frames = core.take_frames()
             if frames:

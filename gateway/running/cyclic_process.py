@@ -146,7 +146,7 @@ def run_guarded(
     ``restart``: how the own controller is brought back after bus-off.
     """
     controller = bus.cyclic.controller
-    restarter = Restarter(controller, bus.link, restart or RestartSettings())
+    restarter = Restarter(controller, bus.cyclic.link, restart or RestartSettings())
     try:
         CycleHost(
             core,

@@ -289,6 +289,7 @@ class FakePcan(can.BusABC):
 def test_a_pcan_adapter_that_is_bus_off_is_no_lost_bus_and_is_reset():
     bus = FakePcan()
     port = PythonCanPort(bus, "pcan", "PCAN_USBBUS1")
+    port.outlives_bus_off = True
     assert port.send(Frame(0x201))
     bus.code = 0x10
     assert not port.send(Frame(0x202))
@@ -319,6 +320,7 @@ def test_socketcand_passes_on_the_kernels_classes_and_other_interfaces_tell_noth
     bus = FakePcan()
     for interface, is_off in (("socketcand", True), ("slcan", False)):
         port = PythonCanPort(bus, interface, "can0")
+        port.outlives_bus_off = True
         bus.coming.append(can.Message(arbitration_id=int(OFF), is_error_frame=True, is_extended_id=True, data=b"\0"))
         assert port.receive() is None
         assert port.controller.is_off is is_off

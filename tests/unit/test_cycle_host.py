@@ -1,19 +1,26 @@
 """The gateway's host on buses, a clock and a sleep that are not real."""
 
+from types import SimpleNamespace
+
 import pytest
 import yaml
 
 from config.loading import load_config, parse_config
 from config.schema import SyncSource
+from drivers.bus_off import Restarter, RestartSettings
+from drivers.can_link import LinkState
+from drivers.controller import BusErrorClass, Controller, ControllerChanged, ErrorState
 from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.real_time import isolated_processors
+from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
 from gateway.record.sample import SampleFlag
 from gateway.running import cycle_bus
 from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
+from gateway.running.controller_watch import ControllerWatch
 from gateway.running.cycle_bus import open_cycle_bus
 from gateway.running.cycle_host import CycleHost
 from gateway.running.preparation import prepare
@@ -194,6 +201,64 @@ def test_isolated_processors_as_the_kernel_lists_them(tmp_path, text, expected):
     assert isolated_processors(tmp_path) == expected
 
 
+class OffLink:
+    """An interface whose controller the kernel restarts."""
+
+    def read(self):
+        return LinkState(None, 20)
+
+    def restart(self):
+        raise AssertionError("that is the kernel's business")
+
+
+@pytest.mark.parametrize("is_kernel", [True, False])
+def test_a_controller_that_is_bus_off_silences_loop_and_kernel_and_stops_the_machine(prepared, is_kernel):
+    """20 ms of bus-off: nothing is offered to the bus, the kernel's SYNC ends at once and is never begun again."""
+    world = World(prepared, is_kernel)
+    world.core.session.is_interruptible = False
+    controller = Controller()
+    watch = ControllerWatch(controller, Restarter(controller, OffLink(), RestartSettings()), world.core)
+    world.host = CycleHost(
+        world.core,
+        world,
+        world.poll,
+        sync=world if is_kernel else None,
+        controller=watch,
+        clock=lambda: world.now_ns,
+        sleep=world.sleep,
+    )
+    ends = {}
+    drained = world.receive
+
+    def receive():
+        # The error frames are read where all frames are.
+        if world.core.loop.cycle >= 50 and "off" not in ends:
+            ends["off"] = world.now_ns
+            controller.take(BusErrorClass.BUS_OFF, b"")
+        elif "off" in ends and "back" not in ends and world.now_ns >= ends["off"] + 20 * MS:
+            ends["back"] = world.now_ns
+            controller.take(BusErrorClass.RESTARTED, b"")
+        if controller.is_off:
+            world.queue.clear()
+        return drained()
+
+    world.receive = receive
+    world.host.run()
+    silent = [frame for at_ns, frame in world.sent if ends["off"] + MS // 100 < at_ns <= ends["back"]]
+    assert silent == []
+    assert world.next_sync_ns is None
+    flagged = [n for n, flags in enumerate(world.samples.flags) if flags & SampleFlag.SEND_BUFFER_FULL]
+    assert 19 <= len(flagged) <= 21
+    assert flagged == list(range(flagged[0], flagged[-1] + 1))
+    syncs = [at_ns for at_ns, frame in world.sent if frame.cob_id == SYNC_COB_ID and at_ns > ends["back"]]
+    assert len(syncs) > 100, "the loop sends SYNC itself, whoever sent it before"
+    words = {frame.data[0] for at_ns, frame in world.sent if frame.cob_id == 0x201 and at_ns > ends["back"]}
+    assert words == {0x02}, "quick stop"
+    told = [event for event in world.core.take_events() if isinstance(event, ControllerChanged)]
+    assert [event.state for event in told] == [ErrorState.OFF, ErrorState.ACTIVE]
+    assert world.core._guard.stopped_by is StopReason.BUS_OFF
+
+
 def with_source(source):
     document = yaml.safe_load(CONFIG.text)
     document["bus"]["sync_source"] = source.value
@@ -204,8 +269,9 @@ def test_the_kernels_sync_on_a_bus_without_one_is_refused():
     address = BusAddress("socketcand", "vcan0", "127.0.0.1", 29536)
     with pytest.raises(GatewayError, match=r"bus\.sync_source: kernel needs the interface socketcan, this bus is"):
         open_cycle_bus(address, with_source(SyncSource.KERNEL), None)
-    bus = open_cycle_bus(address, with_source(SyncSource.AUTO), world := object())
+    bus = open_cycle_bus(address, with_source(SyncSource.AUTO), world := SimpleNamespace())
     assert bus.cyclic is world
+    assert world.outlives_bus_off
     assert bus.sync is None
     assert not bus.sync_setting.is_on
 
@@ -217,7 +283,7 @@ def test_without_a_broadcast_manager_auto_falls_back_to_the_loop(monkeypatch, so
 
     monkeypatch.setattr(cycle_bus, "PeriodicFrame", refuse)
     opened = []
-    monkeypatch.setattr(BusAddress, "open", lambda _self, filters: opened.append(filters) or object())
+    monkeypatch.setattr(BusAddress, "open", lambda _self, filters: opened.append(filters) or SimpleNamespace())
     address = BusAddress("socketcan", "can0", "", 0)
     if source is SyncSource.KERNEL:
         with pytest.raises(BusError):

@@ -87,6 +87,7 @@ def test_error_and_remote_frames_are_told_apart(pair):
 def test_a_port_that_is_bus_off_stays_open_and_sends_nothing_until_it_is_back(pair):
     far, near = pair
     port = SocketcanPort("pair", carrier=near)
+    port.outlives_bus_off = True
     assert port.send(Frame(0x201, b"before"))
     far.send(raw(0x20000000 | BusErrorClass.BUS_OFF, bytes(8)))
     far.send(raw(0x181))
@@ -101,6 +102,14 @@ def test_a_port_that_is_bus_off_stays_open_and_sends_nothing_until_it_is_back(pa
     assert [far.recv(16)[:2] for _ in range(2)] == [b"\x01\x02", b"\x03\x02"]
     with pytest.raises(BlockingIOError):
         far.recv(16)
+
+
+def test_bus_off_is_a_lost_bus_where_nobody_brings_the_controller_back(pair):
+    far, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    far.send(raw(0x20000000 | BusErrorClass.BUS_OFF, bytes(8)))
+    with pytest.raises(BusError, match="bus-off"):
+        received(port)
 
 
 def test_a_socket_without_stamps_says_so_with_zero():

@@ -131,6 +131,7 @@ def test_error_frames_are_counted_and_bus_off_lasts_until_the_restart(port: Sock
     assert port.controller.counts[BusErrorClass.NO_ACKNOWLEDGE] == 2
     assert port.controller.counts[BusErrorClass.BUS_OFF] == 0
     assert port.controller.state is ErrorState.PASSIVE
+    port.outlives_bus_off = True
     raw.send(RAW.pack(CAN_ERR_FLAG | BusErrorClass.BUS_OFF, 8, b""))
     raw.send(RAW.pack(0x082, 0, b""))
     assert next_frame(port)[0] == Frame(0x082)

@@ -1,0 +1,111 @@
+"""A run whose controller goes bus-off, as error frames on a real vcan0 have it, and comes back or does not."""
+
+import json
+import socket
+import struct
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from drivers.controller import BusErrorClass
+from drivers.ports import interface_is_up
+from gateway.record.recording import read_recording
+
+pytestmark = [
+    pytest.mark.vcan,
+    pytest.mark.timeout(400),
+    pytest.mark.skipif(not interface_is_up("vcan0"), reason="there is no CAN interface vcan0 that is up"),
+]
+
+RAW = struct.Struct("=IB3x8s")
+CAN_ERR_FLAG = 0x20000000
+PATIENCE_S = 240.0
+OUTAGE_S = 1.5
+"""Longer than the drives wait for the gateway's heartbeat."""
+SETTLE_S = 0.3
+MOVED_COUNTS = 400
+
+
+@pytest.fixture
+def raw() -> Iterator[socket.socket]:
+    with socket.socket(29, socket.SOCK_RAW, 1) as opened:
+        opened.settimeout(PATIENCE_S)
+        opened.bind(("vcan0",))
+        yield opened
+
+
+def error_frame(raw: socket.socket, what: int) -> None:
+    raw.send(RAW.pack(CAN_ERR_FLAG | what, 8, bytes(8)))
+
+
+def heard(raw: socket.socket, span_s: float) -> list[int]:
+    """COB-IDs of all frames within a span."""
+    cob_ids: list[int] = []
+    end_s = time.monotonic() + span_s
+    while (left_s := end_s - time.monotonic()) > 0.0:
+        raw.settimeout(left_s)
+        try:
+            cob_ids.append(RAW.unpack(raw.recv(16))[0])
+        except TimeoutError:
+            break
+    raw.settimeout(PATIENCE_S)
+    return cob_ids
+
+
+def wait_for_motion(raw: socket.socket) -> None:
+    while True:
+        cob_id, _, data = RAW.unpack(raw.recv(16))
+        if cob_id == 0x201 and abs(int.from_bytes(data[2:6], "little", signed=True)) > MOVED_COUNTS:
+            return
+
+
+@pytest.mark.parametrize("is_coming_back", [True, False])
+def test_a_run_ends_in_order_whether_the_controller_comes_back_or_not(
+    is_coming_back: bool,
+    start_own_sim_drive: Callable[..., dict[str, Any]],
+    unhurried: Path,
+    drive_gateway: Callable[..., "subprocess.Popen[str]"],
+    tmp_path: Path,
+    raw: socket.socket,
+) -> None:
+    config = yaml.safe_load(unhurried.read_text())
+    config["recovery"] = {"bus_off_timeout_s": 10.0 if is_coming_back else 2.0}
+    path = tmp_path / "machine.yaml"
+    path.write_text(yaml.safe_dump(config))
+    start_own_sim_drive("--interface", "socketcan", "--channel", "vcan0", "--realtime", config=str(path))
+    options = ("-i", "socketcan", "-c", "vcan0", "--cycles", "20", "--record", "run.mcap", "--json")
+    process = drive_gateway("run", path, *options, folder=tmp_path)
+    try:
+        wait_for_motion(raw)
+        error_frame(raw, BusErrorClass.BUS_OFF)
+        heard(raw, SETTLE_S)
+        during = heard(raw, OUTAGE_S - SETTLE_S)
+        assert not {0x080, 0x201, 0x202, 0x77F} & set(during), "neither loop nor kernel sends anything"
+        if is_coming_back:
+            error_frame(raw, BusErrorClass.RESTARTED)
+        output, _ = process.communicate(timeout=PATIENCE_S)
+    finally:
+        process.kill()
+    said = (tmp_path / "stderr").read_text()
+    assert process.returncode == 1, said
+    recording = read_recording(tmp_path / "run.mcap")
+    texts = [str(event.data["text"]) for event in recording.events]
+    assert "the gateway's CAN controller is bus-off" in texts
+    told = [text for text in texts if text.startswith("the gateway's CAN controller: ")]
+    assert told[0] == "the gateway's CAN controller: it is restarted after 100 ms"
+    assert told[1].endswith("it has no controller that could be restarted")
+    if is_coming_back:
+        assert json.loads(output)["stopped_by"] == "bus_off"
+        assert "the gateway's CAN controller is error-active, 0 transmit errors, 0 receive errors" in texts
+        axes = [text for text in texts if text.startswith("axis ") and "ready for a new run" in text]
+        assert len(axes) == 2, texts
+    else:
+        assert "the gateway's CAN controller has been bus-off for 2 s and is not back" in said
+        assert recording.stopped_by == "bus_lost"
+    with_sync = heard(raw, 0.1)
+    assert 0x080 not in with_sync
