@@ -28,11 +28,11 @@ class ControllerOutage:
         self._turns = [turn for span in spans_ns for turn in span if turn is not None]
         self.is_off = False
 
-    def receive(self, frame: Frame, now_ns: int) -> None:
+    def receive(self, frame: Frame, now_ns: int) -> bool | None:
         """See Node."""
-        self._turn(now_ns)
-        if not self.is_off:
-            self._node.receive(frame, now_ns)
+        has_turned = self._turn(now_ns)
+        answer = False if self.is_off else self._node.receive(frame, now_ns)
+        return None if has_turned else answer
 
     def next_wake_ns(self) -> int | None:
         """See Node."""
@@ -41,12 +41,12 @@ class ControllerOutage:
             return due_ns
         return self._turns[0] if due_ns is None else min(due_ns, self._turns[0])
 
-    def wake(self, now_ns: int) -> None:
+    def wake(self, now_ns: int) -> bool | None:
         """See Node."""
-        self._turn(now_ns)
+        has_turned = self._turn(now_ns)
         due_ns = self._node.next_wake_ns()
-        if due_ns is not None and due_ns <= now_ns:
-            self._node.wake(now_ns)
+        answer = self._node.wake(now_ns) if due_ns is not None and due_ns <= now_ns else False
+        return None if has_turned else answer
 
     def take_frames(self) -> list[Frame]:
         """See Node."""
@@ -57,9 +57,12 @@ class ControllerOutage:
         """See Node."""
         return self._node.take_events()
 
-    def _turn(self, now_ns: int) -> None:
+    def _turn(self, now_ns: int) -> bool:
+        has_turned = False
         while self._turns and self._turns[0] <= now_ns:
             at_ns = self._turns.pop(0)
             self.is_off = not self.is_off
             state = ErrorState.OFF if self.is_off else ErrorState.ACTIVE
             self._node.controller_changed(ControllerChanged(at_ns, state, OFF_TRANSMIT_ERRORS * self.is_off, 0))
+            has_turned = True
+        return has_turned
