@@ -179,6 +179,17 @@ class SyncSource(Enum):
     """The cyclic loop, on absolute deadlines."""
 
 
+class Timestamps(Enum):
+    """By whose clock the arrival of a frame is told."""
+
+    AUTO = "auto"
+    """The controller's where the interface offers it, else the kernel's."""
+    KERNEL = "kernel"
+    """The kernel's: when it has taken the frame from the driver."""
+    HARDWARE = "hardware"
+    """The controller's: when the frame has been on the bus."""
+
+
 class BusSection(Model):
     """Where the drives are, and how often they are spoken to."""
 
@@ -194,6 +205,7 @@ class BusSection(Model):
     sdo_frames_a_cycle: Annotated[int, Field(ge=1, le=100)] = 2
     """Reserve for SDO while the cycle runs, requests and responses together; no more is sent."""
     sync_source: SyncSource = SyncSource.AUTO
+    timestamps: Timestamps = Timestamps.AUTO
     trace_lateness: bool = False
     """Tell, in the run's events, why cycles were late: processor taken away, stolen by the host, page faults."""
     processor: Annotated[int, Field(ge=0, le=4095)] | None = None

@@ -14,6 +14,7 @@ DATAGRAM_BYTES: Final = 16
 _CONTROL_BYTES: Final = 128
 _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
+_SO_TIMESTAMPING: Final = 37
 
 
 class _Vector(ctypes.Structure):
@@ -43,6 +44,8 @@ _unpack_size: Final = struct.Struct("@N").unpack_from
 _UNSIGNED: Final = struct.Struct("@I")
 _ANCILLARY: Final = struct.Struct("@Nii")
 _TIMESPEC: Final = struct.Struct("@ll")
+_TIMESTAMPING: Final = struct.Struct("@llllll")
+"""``struct scm_timestamping``: the kernel's stamp, a legacy one that stays empty, the hardware's."""
 _STAMP: Final = struct.Struct("@Niill")
 _ALIGNMENT: Final = ctypes.sizeof(ctypes.c_size_t)
 
@@ -57,6 +60,8 @@ class MessageBatch:
         """``capacity``: datagrams at most in a call."""
         self.drop_count = 0
         """Datagrams that the kernel had no room for, where the socket tells (SO_RXQ_OVFL)."""
+        self.hardware_ns = 0
+        """Stamp by the controller's clock of the datagram that ``stamp_ns`` was asked for last; 0 where it has none."""
         self.capacity: Final = capacity
         self._descriptor = receiver.fileno()
         self._data = ctypes.create_string_buffer(DATAGRAM_BYTES * capacity)
@@ -110,12 +115,17 @@ class MessageBatch:
             _, _, kind, seconds, nanoseconds = _STAMP.unpack_from(self._ancillary, offset)
             if kind == _SO_TIMESTAMPNS:
                 return seconds * 1_000_000_000 + nanoseconds
-        stamp_ns = 0
+        stamp_ns = self.hardware_ns = 0
         while left >= _ANCILLARY.size:
             length, _, kind = _ANCILLARY.unpack_from(self._ancillary, offset)
             if kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(self._ancillary, offset + _ANCILLARY.size)
                 stamp_ns = seconds * 1_000_000_000 + nanoseconds
+            elif kind == _SO_TIMESTAMPING:
+                stamps = _TIMESTAMPING.unpack_from(self._ancillary, offset + _ANCILLARY.size)
+                seconds, nanoseconds, _, _, hardware_s, hardware_ns = stamps
+                stamp_ns = seconds * 1_000_000_000 + nanoseconds
+                self.hardware_ns = hardware_s * 1_000_000_000 + hardware_ns
             elif kind == _SO_RXQ_OVFL:
                 (self.drop_count,) = _UNSIGNED.unpack_from(self._ancillary, offset + _ANCILLARY.size)
             step = -(-max(length, _ANCILLARY.size) // _ALIGNMENT) * _ALIGNMENT

@@ -94,6 +94,7 @@ class RealTimeFeature(Enum):
     PROCESSOR = "processor of its own"
     IDLE_LATENCY = "short idle states"
     KERNEL_SYNC = "SYNC from the kernel"
+    HARDWARE_STAMPS = "hardware timestamps"
 
 
 @dataclass(frozen=True, slots=True)

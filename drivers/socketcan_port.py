@@ -1,4 +1,4 @@
-"""A SocketCAN raw socket with kernel time stamps, kernel filters and error frames."""
+"""A SocketCAN raw socket with kernel or hardware time stamps, kernel filters and error frames."""
 
 import errno
 import os
@@ -15,6 +15,8 @@ from drivers.can_link import NetworkLink
 from drivers.controller import Controller
 from drivers.errors import BusError
 from drivers.frame import MAX_DATA_LENGTH, Frame
+from drivers.hardware_clock import HardwareClock
+from drivers.hardware_stamps import BOTH_STAMPS, SO_TIMESTAMPING
 from drivers.message_batch import MessageBatch
 
 # linux/can.h, linux/can/raw.h and asm-generic/socket.h; written out so that the module can be imported anywhere.
@@ -76,11 +78,24 @@ class SocketcanPort:
         if hears_own:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_RECV_OWN_MSGS, 1)
         self._clock: Final = ArrivalClock()
+        self._hardware_clock: HardwareClock | None = None
         self._batch: Final = MessageBatch(self._socket)
         self._batch_count = 0
         self._batch_next = 0
         self._may_hold_more = True
         self._empty_ns = 0
+
+    def use_hardware_stamps(self) -> None:
+        """Tell arrivals by the controller's own clock, of every frame that it has stamped; see ``hardware_stamps``.
+
+        Raises BusError where the kernel knows no such thing.
+        """
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 0)
+            self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPING, BOTH_STAMPS)
+        except OSError as error:
+            raise self._error(f"it has no hardware timestamps ({error.strerror})") from None
+        self._hardware_clock = HardwareClock()
 
     @property
     def lost_frame_count(self) -> int:
@@ -155,7 +170,10 @@ class SocketcanPort:
                 continue
             else:
                 frame = Frame(identifier & _CAN_SFF_MASK, b"", True)
-            return frame, self._clock.arrival_ns(self._batch.stamp_ns(number))
+            arrival_ns = self._clock.arrival_ns(self._batch.stamp_ns(number))
+            if self._hardware_clock is not None and self._batch.hardware_ns:
+                arrival_ns = self._hardware_clock.arrival_ns(self._batch.hardware_ns, arrival_ns)
+            return frame, arrival_ns
         return None
 
     def _fetch(self) -> bool:

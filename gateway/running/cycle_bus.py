@@ -3,9 +3,10 @@
 from dataclasses import dataclass
 from typing import Final
 
-from config.schema import GatewayConfig, SyncSource
+from config.schema import GatewayConfig, SyncSource, Timestamps
 from drivers.broadcast_manager import PeriodicFrame
 from drivers.errors import BusError
+from drivers.hardware_stamps import why_no_hardware_stamps
 from drivers.nmt import EMCY_BASE, HEARTBEAT_BASE, SYNC_COB_ID
 from drivers.pdo import RPDO_BASE, TPDO_BASE
 from drivers.ports import Port
@@ -30,6 +31,8 @@ class CycleBus:
     sync: PeriodicFrame | None
     """The kernel's SYNC; None where the loop sends it."""
     sync_setting: RealTimeSetting
+    stamp_setting: RealTimeSetting
+    """By whose clock the arrival of a TPDO is told."""
     echo_cob_id: int | None = None
     """Of the last demand of a cycle, where ``cyclic`` hears it when it has been on the bus."""
 
@@ -45,16 +48,18 @@ class CycleBus:
 def open_cycle_bus(address: BusAddress, config: GatewayConfig, listener: Port) -> CycleBus:
     """Open what a run needs. ``listener`` is an open port on the same bus, used where one port has to do for all.
 
-    Raises BusError, and GatewayError for a kernel's SYNC on a bus that has none.
+    Raises BusError, and GatewayError for a kernel's SYNC, or hardware timestamps, on a bus that has none.
     """
     source = config.bus.sync_source
+    stamps = _stamp_setting(address, config.bus.timestamps)
     if address.interface != "socketcan":
         if source is SyncSource.KERNEL:
             raise GatewayError(
                 f"bus.sync_source: kernel needs the interface socketcan, this bus is {address} (auto or loop)"
             )
         listener.outlives_bus_off = True
-        return CycleBus(listener, None, None, _loop_setting(f"{address.interface} has no timer of its own"))
+        setting = _loop_setting(f"{address.interface} has no timer of its own")
+        return CycleBus(listener, None, None, setting, stamps)
     sync, setting = _sync_timer(address, config)
     node_ids = [axis.node_id for axis in config.ordered_axes]
     tpdos = [TPDO_BASE[0] + node_id for node_id in node_ids]
@@ -67,7 +72,25 @@ def open_cycle_bus(address: BusAddress, config: GatewayConfig, listener: Port) -
     bases = (EMCY_BASE, SDO_RESPONSE_BASE, HEARTBEAT_BASE)
     service = address.open(_exactly([base + node_id for node_id in node_ids for base in bases]))
     cyclic.outlives_bus_off = service.outlives_bus_off = True
-    return CycleBus(cyclic, service, sync, setting, echo)
+    if stamps.is_on and isinstance(cyclic, SocketcanPort):
+        cyclic.use_hardware_stamps()
+    return CycleBus(cyclic, service, sync, setting, stamps, echo)
+
+
+def _stamp_setting(address: BusAddress, wanted: Timestamps) -> RealTimeSetting:
+    """By whose clock arrivals are told, and why. Raises GatewayError where the wanted one is not to be had."""
+    feature = RealTimeFeature.HARDWARE_STAMPS
+    if wanted is Timestamps.KERNEL:
+        return RealTimeSetting(feature, False, "bus.timestamps is kernel")
+    if address.interface == "socketcan":
+        reason = why_no_hardware_stamps(address.channel)
+    else:
+        reason = f"{address.interface} tells by which clock it stamps, if at all, to nobody"
+    if not reason:
+        return RealTimeSetting(feature, True, f"by the clock of {address.channel}'s controller")
+    if wanted is Timestamps.HARDWARE:
+        raise GatewayError(f"bus.timestamps: hardware is not to be had on {address}: {reason} (auto or kernel)")
+    return RealTimeSetting(feature, False, reason)
 
 
 def _sync_timer(address: BusAddress, config: GatewayConfig) -> tuple[PeriodicFrame | None, RealTimeSetting]:

@@ -190,6 +190,7 @@ def join_bus(address: BusAddress, config: GatewayConfig, ring: RingWriter) -> Cy
     if bus.cyclic is not listener:
         listener.close()
     tell_setting(ring, bus.sync_setting)
+    tell_setting(ring, bus.stamp_setting)
     return bus
 
 

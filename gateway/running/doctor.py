@@ -1,6 +1,7 @@
 """What this machine offers a loop that must be on time, and its CAN interfaces: findings, each with a remedy.
 
-Everything is read from the kernel's files under ``root`` and from what ``ip`` says of interfaces; nothing is changed.
+Everything is read from the kernel's files under ``root``, and from what ``ip`` and the kernel say of interfaces;
+nothing is changed.
 """
 
 import json
@@ -15,6 +16,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
+from drivers.hardware_stamps import why_no_hardware_stamps
 from drivers.real_time import isolated_processors
 
 PRIORITY: Final = 80
@@ -23,6 +25,7 @@ SAMPLE_POINTS: Final = (0.85, 0.90)
 """CiA 301 wants the sample point at 87.5 % of the bit, or close to it."""
 LEAST_QUEUE: Final = 32
 """Frames that a transmit queue should hold; the kernel's own default for CAN, 10, is a burst of SDO."""
+_CAP_NET_ADMIN: Final = 12
 _CAP_IPC_LOCK: Final = 14
 _CAP_SYS_NICE: Final = 23
 _AF_CAN: Final = 29
@@ -47,6 +50,7 @@ class Topic(Enum):
     SAMPLE_POINT = "sample point"
     QUEUE = "transmit queue"
     RESTART = "restart after bus-off"
+    TIMESTAMPS = "timestamps"
 
 
 class Verdict(Enum):
@@ -225,7 +229,7 @@ def can_findings(wanted: Wanted, root: Path, links: list[dict[str, Any]]) -> lis
     by_name = {str(link.get("ifname")): link for link in links}
     findings = _socketcan(bool(names))
     for name in names:
-        findings += interface_findings(name, by_name.get(name, {}), net / name, wanted)
+        findings += interface_findings(name, by_name.get(name, {}), root, wanted)
     if wanted.channel is not None and wanted.channel not in names:
         remedy = f"'ip link add {wanted.channel} type vcan' for a virtual one, or an adapter and its driver"
         findings.append(
@@ -255,16 +259,17 @@ def _socketcan(has_interfaces: bool) -> list[Finding]:
     return findings
 
 
-def interface_findings(name: str, link: dict[str, Any], folder: Path, wanted: Wanted) -> list[Finding]:
-    """One interface: ``link`` is what ``ip`` says of it (or nothing), ``folder`` its entry in /sys/class/net."""
+def interface_findings(name: str, link: dict[str, Any], root: Path, wanted: Wanted) -> list[Finding]:
+    """One interface: ``link`` is what ``ip`` says of it (or nothing), ``root`` holds the kernel's files."""
+    folder = root / "sys/class/net" / name
     info: dict[str, Any] = link.get("linkinfo") or {}
     data: dict[str, Any] = info.get("info_data") or {}
     is_virtual = info.get("info_kind") in ("vcan", "vxcan") or "virtual" in folder.resolve().parts
-    findings = [_state(name, data, folder)]
+    findings = [_state(name, data, folder), _timestamps(name)]
     if is_virtual:
         findings.append(Finding(Topic.BIT_RATE, name, Verdict.GOOD, "virtual: none, frames take no time"))
     elif data:
-        findings += [_bit_rate(name, data, wanted), _sample_point(name, data), _restart(name, data)]
+        findings += [_bit_rate(name, data, wanted), _sample_point(name, data), _restart(name, data, root)]
     else:
         found = "unknown: there is no ip, or it tells nothing"
         findings.append(Finding(Topic.BIT_RATE, name, Verdict.ADVICE, found, "install iproute2"))
@@ -276,6 +281,12 @@ def interface_findings(name: str, link: dict[str, Any], folder: Path, wanted: Wa
             Finding(Topic.QUEUE, name, Verdict.GOOD if good else Verdict.ADVICE, f"{length} frames", remedy)
         )
     return findings
+
+
+def _timestamps(name: str) -> Finding:
+    reason = why_no_hardware_stamps(name)
+    found = f"the kernel's: {reason}" if reason else "by the controller's own clock"
+    return Finding(Topic.TIMESTAMPS, name, Verdict.GOOD, found)
 
 
 def _state(name: str, data: dict[str, Any], folder: Path) -> Finding:
@@ -320,12 +331,15 @@ def _sample_point(name: str, data: dict[str, Any]) -> Finding:
     return Finding(topic, name, Verdict.ADVICE, f"{point:.1%}", remedy)
 
 
-def _restart(name: str, data: dict[str, Any]) -> Finding:
+def _restart(name: str, data: dict[str, Any], root: Path) -> Finding:
     topic = Topic.RESTART
     restart_ms = data.get("restart_ms", 0)
     if isinstance(restart_ms, int) and restart_ms > 0:
         return Finding(topic, name, Verdict.GOOD, f"after {restart_ms} ms")
-    return Finding(topic, name, Verdict.ADVICE, "by hand", f"ip link set {name} type can restart-ms 100")
+    remedy = f"ip link set {name} type can restart-ms 100, with the interface down"
+    if _has_capability(root, _CAP_NET_ADMIN):
+        return Finding(topic, name, Verdict.GOOD, "by the gateway itself, which has CAP_NET_ADMIN")
+    return Finding(topic, name, Verdict.ADVICE, "by hand: the gateway has no CAP_NET_ADMIN to do it", remedy)
 
 
 # -- reading -----------------------------------------------------------------------------------------------------

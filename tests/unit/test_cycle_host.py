@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from config.loading import load_config, parse_config
-from config.schema import SyncSource
+from config.schema import SyncSource, Timestamps
 from drivers.bus_off import Restarter, RestartSettings
 from drivers.can_link import LinkState
 from drivers.controller import BusErrorClass, Controller, ControllerChanged, ErrorState
@@ -14,6 +14,7 @@ from drivers.errors import BusError
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.real_time import isolated_processors
+from drivers.socketcan_port import SocketcanPort
 from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
 from gateway.record.sample import SampleFlag
@@ -274,6 +275,48 @@ def test_the_kernels_sync_on_a_bus_without_one_is_refused():
     assert world.outlives_bus_off
     assert bus.sync is None
     assert not bus.sync_setting.is_on
+
+
+def with_timestamps(timestamps):
+    document = yaml.safe_load(CONFIG.text)
+    document["bus"] |= {"timestamps": timestamps.value, "sync_source": "loop"}
+    return parse_config(yaml.safe_dump(document), CONFIG.path)
+
+
+class StampingPort(SocketcanPort):
+    """A port whose interface stamps frames; without any."""
+
+    def __init__(self):
+        self.has_hardware_stamps = False
+
+    def use_hardware_stamps(self):
+        self.has_hardware_stamps = True
+
+
+@pytest.mark.parametrize(
+    ("wanted", "refusal", "is_on", "reason"),
+    [
+        (Timestamps.AUTO, "", True, "by the clock of can0's controller"),
+        (Timestamps.AUTO, "can0 has none", False, "can0 has none"),
+        (Timestamps.KERNEL, "", False, "bus.timestamps is kernel"),
+        (Timestamps.HARDWARE, "", True, "by the clock of can0's controller"),
+    ],
+)
+def test_whose_stamps_are_used_is_told_and_why(monkeypatch, wanted, refusal, is_on, reason):
+    monkeypatch.setattr(cycle_bus, "why_no_hardware_stamps", lambda channel: refusal)
+    monkeypatch.setattr(BusAddress, "open", lambda _self, filters: StampingPort())
+    bus = open_cycle_bus(BusAddress("socketcan", "can0", "", 0), with_timestamps(wanted), None)
+    assert (bus.stamp_setting.is_on, bus.stamp_setting.reason) == (is_on, reason)
+    assert bus.cyclic.has_hardware_stamps is is_on
+    assert not bus.service.has_hardware_stamps
+
+
+@pytest.mark.parametrize(("interface", "why"), [("socketcan", "vcan0 has none"), ("socketcand", "socketcand tells")])
+def test_hardware_stamps_that_are_not_to_be_had_are_one_sentence(monkeypatch, interface, why):
+    monkeypatch.setattr(cycle_bus, "why_no_hardware_stamps", lambda channel: f"{channel} has none")
+    address = BusAddress(interface, "vcan0", "127.0.0.1", 29536)
+    with pytest.raises(GatewayError, match=r"^bus\.timestamps: hardware is not to be had on [^\n]*" + why):
+        open_cycle_bus(address, with_timestamps(Timestamps.HARDWARE), None)
 
 
 @pytest.mark.parametrize("source", list(SyncSource))

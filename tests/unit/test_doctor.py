@@ -43,6 +43,11 @@ def by_topic(findings, where=""):
     return {finding.topic: finding for finding in findings if finding.where == where}
 
 
+@pytest.fixture(autouse=True)
+def no_hardware_stamps(monkeypatch):
+    monkeypatch.setattr(doctor, "why_no_hardware_stamps", lambda name: f"{name} has none")
+
+
 def can(root, link, wanted=None):
     return by_topic(can_findings(wanted or Wanted(), root, [link]), "can0")
 
@@ -99,7 +104,22 @@ def test_a_good_can_interface(tmp_path):
         Topic.SAMPLE_POINT: "87.5%",
         Topic.RESTART: "after 100 ms",
         Topic.QUEUE: "100 frames",
+        Topic.TIMESTAMPS: "the kernel's: can0 has none",
     }
+
+
+def test_hardware_stamps_and_a_gateway_that_restarts_its_controller_are_told(tmp_path, monkeypatch):
+    interface(tmp_path, "can0")
+    write(tmp_path, proc__self__status="Name: x\nCapEff:\t0000000000001000")
+    monkeypatch.setattr(doctor, "why_no_hardware_stamps", lambda name: "")
+    link = json.loads(json.dumps(GOOD_CAN))
+    link["linkinfo"]["info_data"]["restart_ms"] = 0
+    found = can(tmp_path, link)
+    assert found[Topic.TIMESTAMPS].found == "by the controller's own clock"
+    assert (found[Topic.RESTART].verdict, found[Topic.RESTART].found) == (
+        Verdict.GOOD,
+        "by the gateway itself, which has CAP_NET_ADMIN",
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +127,8 @@ def test_a_good_can_interface(tmp_path):
     [
         ({"state": "BUS-OFF"}, Topic.INTERFACE, Verdict.PROBLEM, "bus-off", "type can restart"),
         ({"state": "ERROR-PASSIVE"}, Topic.INTERFACE, Verdict.ADVICE, "up, error-passive", "termination"),
-        ({"restart_ms": 0}, Topic.RESTART, Verdict.ADVICE, "by hand", "ip link set can0 type can restart-ms 100"),
+        ({"restart_ms": 0}, Topic.RESTART, Verdict.ADVICE, "by hand: the gateway has no CAP_NET_ADMIN to do it",
+             "ip link set can0 type can restart-ms 100"),
         ({"bittiming": {"bitrate": 500000, "sample_point": "0.875"}}, Topic.BIT_RATE, Verdict.PROBLEM,
          "500000 bit/s, the configuration says 1000000", "type can bitrate 1000000"),
         ({"bittiming": {"bitrate": 0}}, Topic.BIT_RATE, Verdict.PROBLEM, "not set", "bitrate 1000000"),

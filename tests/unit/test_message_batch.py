@@ -1,6 +1,7 @@
 """The SocketCAN port over sockets that every system has: batches, time stamps, what is skipped."""
 
 import socket
+import struct
 import time
 
 import pytest
@@ -15,6 +16,8 @@ from drivers.message_batch import MessageBatch
 from drivers.socketcan_port import CAN_FRAME, SocketcanPort
 
 SO_TIMESTAMPNS = 35
+CONTROL_LENGTH_OFFSET = 40
+"""Of ``struct msghdr`` on a machine of 64 bits."""
 
 
 @pytest.fixture
@@ -158,3 +161,75 @@ def test_whatever_the_bursts_nothing_is_lost_or_told_twice(bursts):
 def test_no_broadcast_manager_is_one_sentence():
     with pytest.raises(BusError, match=r"nosuchcan9: (this system offers no CAN broadcast manager|the broadcast)"):
         PeriodicFrame("nosuchcan9", Frame(0x080), 1000)
+
+
+def test_stamps_of_kernel_and_controller_are_told_apart():
+    """The control message as the kernel writes it; the controller's stamp is no time of day, and need not be there."""
+    far, near = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    with far, near:
+        batch = MessageBatch(near, 2)
+        both = struct.pack("@Nii6l", 64, socket.SOL_SOCKET, 37, 1_700_000_000, 5, 0, 0, 12, 345_678_000)
+        drops = struct.pack("@NiiI4x", 20, socket.SOL_SOCKET, 40, 7)
+        for number, control in ((0, both), (1, drops + both[:48] + bytes(16))):
+            batch._ancillary[128 * number : 128 * number + len(control)] = control
+            struct.pack_into("@N", batch._raw, len(batch._raw) // 2 * number + CONTROL_LENGTH_OFFSET, len(control))
+        assert batch.stamp_ns(0) == 1_700_000_000_000_000_005
+        assert batch.hardware_ns == 12_345_678_000
+        assert batch.stamp_ns(1) == 1_700_000_000_000_000_005
+        assert (batch.hardware_ns, batch.drop_count) == (0, 7)
+
+
+class Stamped:
+    """A batch whose datagrams carry stamps of the test's own."""
+
+    capacity = 16
+    drop_count = 0
+
+    def __init__(self, stamps):
+        self.stamps = stamps
+        self.data = memoryview(b"".join(raw(0x181) for _ in stamps))
+        self.hardware_ns = 0
+        self.is_read = False
+
+    def receive(self):
+        count, self.is_read = 0 if self.is_read else len(self.stamps), True
+        return count
+
+    def stamp_ns(self, number):
+        software_ns, self.hardware_ns = self.stamps[number]
+        return software_ns
+
+
+def test_the_controllers_stamps_take_the_jitter_out_of_arrivals_and_frames_without_one_keep_the_kernels(pair):
+    _, near = pair
+    port = SocketcanPort("pair", carrier=near)
+    port.use_hardware_stamps()
+    now_ns = time.time_ns()
+    # Every 100 us; late by 0, 50, 30 us and 10 us, the third one not stamped by the controller.
+    lateness_us = (0, 50, 30, 10)
+    port._batch = Stamped(
+        [
+            (now_ns - 500_000 + 100_000 * n + 1000 * late, 0 if n == 2 else 7_000_000 + 100_000 * n)
+            for n, late in enumerate(lateness_us)
+        ]
+    )
+    arrivals = [port.receive()[1] for _ in lateness_us]
+    assert [at_ns - arrivals[0] for at_ns in arrivals] == [0, 100_000, 230_000, 300_000]
+
+
+def test_a_socket_that_is_asked_for_both_stamps_still_has_the_kernels():
+    """As a real interface without a clock of its own has it: the loopback's."""
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as near,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far,
+    ):
+        near.bind(("127.0.0.1", 0))
+        near.setblocking(False)
+        port = SocketcanPort("loopback", carrier=near)
+        port.use_hardware_stamps()
+        far.sendto(raw(0x181), near.getsockname())
+        near_ns = time.time_ns()
+        assert port.wait(5.0)
+        assert port._batch.receive() == 1
+        assert abs(port._batch.stamp_ns(0) - near_ns) < 1_000_000_000
+        assert port._batch.hardware_ns == 0

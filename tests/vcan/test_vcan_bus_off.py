@@ -27,7 +27,7 @@ CAN_ERR_FLAG = 0x20000000
 PATIENCE_S = 240.0
 OUTAGE_S = 1.5
 """Longer than the drives wait for the gateway's heartbeat."""
-SETTLE_S = 0.3
+SETTLE_S = 0.5
 MOVED_COUNTS = 400
 
 
@@ -53,7 +53,6 @@ def heard(raw: socket.socket, span_s: float) -> list[int]:
             cob_ids.append(RAW.unpack(raw.recv(16))[0])
         except TimeoutError:
             break
-    raw.settimeout(PATIENCE_S)
     return cob_ids
 
 
@@ -83,14 +82,18 @@ def test_a_run_ends_in_order_whether_the_controller_comes_back_or_not(
     try:
         wait_for_motion(raw)
         error_frame(raw, BusErrorClass.BUS_OFF)
-        heard(raw, SETTLE_S)
-        during = heard(raw, OUTAGE_S - SETTLE_S)
+        time.sleep(SETTLE_S)
+        with socket.socket(29, socket.SOCK_RAW, 1) as meanwhile:
+            # A socket of its own has nothing left over from before.
+            meanwhile.bind(("vcan0",))
+            during = heard(meanwhile, OUTAGE_S - SETTLE_S)
         assert not {0x080, 0x201, 0x202, 0x77F} & set(during), "neither loop nor kernel sends anything"
         if is_coming_back:
             error_frame(raw, BusErrorClass.RESTARTED)
         output, _ = process.communicate(timeout=PATIENCE_S)
     finally:
         process.kill()
+        process.wait(PATIENCE_S)
     said = (tmp_path / "stderr").read_text()
     assert process.returncode == 1, said
     recording = read_recording(tmp_path / "run.mcap")
