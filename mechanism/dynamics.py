@@ -145,6 +145,15 @@ def mass_matrix_and_bias(
     theta in rad, omega in rad/s, closure +1 or -1 (`Closure`). M is symmetric; index 1 is the CV axis, 2 the servo
     axis.
     """
+    m11, m12, m22, h1, h2, _ = motion_terms(params, theta2, theta5, omega2, omega5, closure)
+    return m11, m12, m22, h1, h2
+
+
+@kernel
+def motion_terms(
+    params: Float, theta2: float, theta5: float, omega2: float, omega5: float, closure: int
+) -> tuple[float, float, float, float, float, float]:
+    """`mass_matrix_and_bias`, and after it `linkage_sine`, for which the linkage is assembled but once."""
     p = params[0]
     q = params[1]
     r = params[2]
@@ -264,7 +273,7 @@ def mass_matrix_and_bias(
     m22 += inertia * k45 * k45
     h1 += inertia * k42 * alpha4
     h2 += inertia * k45 * alpha4
-    return m11, m12, m22, h1, h2
+    return m11, m12, m22, h1, h2, sine
 
 
 @kernel

@@ -88,7 +88,7 @@ def _slopes(
     """
     a2, on2, friction2, flow2 = _axis_torques(settings, couplings, 0, y[0], y[4], y[2], y[6], torque2)
     a5, on5, friction5, flow5 = _axis_torques(settings, couplings, 1, y[1], y[5], y[3], y[7], torque5)
-    link2, link5, m11, m12, m22 = five_bar_acceleration(dynamics, closure, y[2], y[3], y[6], y[7], on2, on5)
+    link2, link5, m11, m12, m22, sine = five_bar_acceleration(dynamics, closure, y[2], y[3], y[6], y[7], on2, on5)
     for i in range(4):
         slope[i] = y[i + 4]
     slope[4] = 0.0 if is_held2 else (a2 if couplings[0, STIFFNESS] < inf else link2)
@@ -101,7 +101,7 @@ def _slopes(
     slope[_FRICTION + 1] = friction5 * y[5]
     slope[_FLOW] = flow2
     slope[_FLOW + 1] = flow5
-    return m11, m12, m22, abs(linkage_sine(dynamics, y[2], y[3], closure))
+    return m11, m12, m22, sine
 
 
 @kernel

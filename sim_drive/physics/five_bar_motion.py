@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanism.dynamics import linkage_sine, mass_matrix_and_bias
+from mechanism.dynamics import motion_terms
 from mechanism.jit import kernel
 from sim_drive.physics.driveline import (
     DRY_HEAT,
@@ -43,13 +43,16 @@ def five_bar_acceleration(
     omega5: float,
     torque2: float,
     torque5: float,
-) -> tuple[float, float, float, float, float]:
-    """(theta2'', theta5'', m11, m12, m22) under torques that have friction taken off; rad/s2 and kg m2."""
-    m11, m12, m22, h1, h2 = mass_matrix_and_bias(dynamics, theta2, theta5, omega2, omega5, closure)
+) -> tuple[float, float, float, float, float, float]:
+    """(theta2'', theta5'', m11, m12, m22, |sin(theta3 - theta4)|) under torques that have friction taken off.
+
+    rad/s2 and kg m2.
+    """
+    m11, m12, m22, h1, h2, sine = motion_terms(dynamics, theta2, theta5, omega2, omega5, closure)
     b1 = torque2 - h1
     b2 = torque5 - h2
     determinant = m11 * m22 - m12 * m12
-    return (m22 * b1 - m12 * b2) / determinant, (m11 * b2 - m12 * b1) / determinant, m11, m12, m22
+    return (m22 * b1 - m12 * b2) / determinant, (m11 * b2 - m12 * b1) / determinant, m11, m12, m22, abs(sine)
 
 
 @kernel
@@ -88,27 +91,29 @@ def advance_five_bar(
         torque2, middle2, end2 = torques_of_step(settings, 0, wanted2, torque2, v2)
         torque5, middle5, end5 = torques_of_step(settings, 1, wanted5, torque5, v5)
 
-        worst = abs(linkage_sine(dynamics, x2, x5, closure))
         f2, f5 = smooth_resistance(settings, 0, v2), smooth_resistance(settings, 1, v5)
-        p2, p5, _, _, _ = five_bar_acceleration(dynamics, closure, x2, x5, v2, v5, torque2 - f2, torque5 - f5)
+        p2, p5, _, _, _, worst = five_bar_acceleration(dynamics, closure, x2, x5, v2, v5, torque2 - f2, torque5 - f5)
         vb2, vb5 = v2 + half * p2, v5 + half * p5
         xb2, xb5 = x2 + half * v2, x5 + half * v5
-        sine = abs(linkage_sine(dynamics, xb2, xb5, closure))
-        worst = sine if sine < worst else worst
         fb2, fb5 = smooth_resistance(settings, 0, vb2), smooth_resistance(settings, 1, vb5)
-        q2, q5, _, _, _ = five_bar_acceleration(dynamics, closure, xb2, xb5, vb2, vb5, middle2 - fb2, middle5 - fb5)
+        q2, q5, _, _, _, sine = five_bar_acceleration(
+            dynamics, closure, xb2, xb5, vb2, vb5, middle2 - fb2, middle5 - fb5
+        )
+        worst = sine if sine < worst else worst
         vc2, vc5 = v2 + half * q2, v5 + half * q5
         xc2, xc5 = x2 + half * vb2, x5 + half * vb5
-        sine = abs(linkage_sine(dynamics, xc2, xc5, closure))
-        worst = sine if sine < worst else worst
         fc2, fc5 = smooth_resistance(settings, 0, vc2), smooth_resistance(settings, 1, vc5)
-        r2, r5, _, _, _ = five_bar_acceleration(dynamics, closure, xc2, xc5, vc2, vc5, middle2 - fc2, middle5 - fc5)
+        r2, r5, _, _, _, sine = five_bar_acceleration(
+            dynamics, closure, xc2, xc5, vc2, vc5, middle2 - fc2, middle5 - fc5
+        )
+        worst = sine if sine < worst else worst
         vd2, vd5 = v2 + step_s * r2, v5 + step_s * r5
         xd2, xd5 = x2 + step_s * vc2, x5 + step_s * vc5
-        sine = abs(linkage_sine(dynamics, xd2, xd5, closure))
-        worst = sine if sine < worst else worst
         fd2, fd5 = smooth_resistance(settings, 0, vd2), smooth_resistance(settings, 1, vd5)
-        s2, s5, m11, m12, m22 = five_bar_acceleration(dynamics, closure, xd2, xd5, vd2, vd5, end2 - fd2, end5 - fd5)
+        s2, s5, m11, m12, m22, sine = five_bar_acceleration(
+            dynamics, closure, xd2, xd5, vd2, vd5, end2 - fd2, end5 - fd5
+        )
+        worst = sine if sine < worst else worst
         # A stage in which the linkage does not close is NaN, and so is every stage that follows it.
         if not worst >= singular_sine or isnan(s2) or isnan(s5):
             torn = step + 1
