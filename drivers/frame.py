@@ -1,5 +1,6 @@
 """The CAN frame as it travels between cores, and its length on the wire."""
 
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 MAX_DATA_LENGTH: Final = 8
@@ -20,6 +21,14 @@ class Frame(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.cob_id:03X}#{'R' if self.is_remote else self.data.hex().upper()}"
+
+
+_new: Final[Callable[[type[Frame], tuple[int, bytes, bool]], Frame]] = tuple.__new__
+
+
+def data_frame(cob_id: int, data: bytes) -> Frame:
+    """``Frame(cob_id, data)`` at half the cost, for what sends in every cycle."""
+    return _new(Frame, (cob_id, data, False))
 
 
 def worst_case_bits(data_length: int) -> int:

@@ -137,7 +137,8 @@ class MeasuredMotion(Motion):
         """
         if now_ns == self._sampled_at_ns:
             return
-        position, _, torque = self.latch(now_ns)
+        latch = self.latch
+        position, _, torque = latch(now_ns)
         if self.unit != 1.0:
             position = self.scaling.position(position)
         shown = position + self.offset

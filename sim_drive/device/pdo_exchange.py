@@ -49,7 +49,7 @@ class PdoExchange:
         "_sync_cob_id",
         "_sync_period",
         "_sync_rpdos",
-        "_sync_tpdos",
+        "_sync_senders",
         "_sync_window",
         "_tpdos",
         "_waiting_tpdos",
@@ -81,7 +81,8 @@ class PdoExchange:
         self._rpdos = [ReceivePdo(number, dictionary, self._axes, emergency, self.rearrange) for number in numbers]
         self._tpdos = [TransmitPdo(number, dictionary, self._axes, outbox, self.rearrange) for number in numbers]
         self._sync_rpdos: tuple[ReceivePdo, ...] = ()
-        self._sync_tpdos: tuple[TransmitPdo, ...] = ()
+        self._sync_senders: tuple[Callable[[int], None], ...] = ()
+        """What a SYNC has each synchronous TPDO do."""
         self._samplers: tuple[Callable[[int], None], ...] = ()
         """What a SYNC has sampled, for its TPDOs to send."""
         self.event_tpdos: tuple[TransmitPdo, ...] = ()
@@ -133,7 +134,7 @@ class PdoExchange:
         has_counter = bool(self._counter_overflow.value)
         waiting = [tpdo for tpdo in synchronous if has_counter and tpdo.sync_start_value and not tpdo.has_started]
         self._waiting_tpdos = tuple(waiting)
-        self._sync_tpdos = tuple(tpdo for tpdo in synchronous if tpdo not in waiting)
+        self._sync_senders = tuple(tpdo.sync_sender for tpdo in synchronous if tpdo not in waiting)
         measured = {entry.variable.index for tpdo in synchronous for entry in tpdo.entries if entry.on_read is not None}
         samplers: list[Callable[[int], None]] = []
         for axis in self._axes:
@@ -272,8 +273,8 @@ class PdoExchange:
             self._emergency.end_cause(EmergencyCode.SYNC_LENGTH, now_ns)
         for sample in self._samplers:
             sample(now_ns)
-        for tpdo in self._sync_tpdos:
-            tpdo.on_sync(now_ns)
+        for send in self._sync_senders:
+            send(now_ns)
         for axis in self._axes:
             axis.source = _SYNC
         for rpdo in self._sync_rpdos:
@@ -282,7 +283,8 @@ class PdoExchange:
                 rpdo.pending = None
                 rpdo.apply(pending, now_ns)
         for axis in self._axes:
-            axis.on_sync(now_ns)
+            on_sync = axis.on_sync
+            on_sync(now_ns)
             axis.source = _SDO
 
     def _on_noted_sync(self, data: bytes, now_ns: int) -> None:

@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import Any, Final, Protocol
 
 from drivers import objects
-from drivers.frame import Frame
+from drivers.frame import Frame, data_frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.object_dictionary import FORMAT
 from drivers.pdo import PDO_COB_ID_INVALID, PDO_COB_ID_NO_RTR, PDO_MAX_ENTRIES, MappingEntry
@@ -122,6 +122,21 @@ def compile_mapping(mapped: Sequence[Entry]) -> tuple[tuple[Entry, ...], int, _C
             fields.append((start, n, FORMAT[entry.data_type].islower()))
         start += n
     return real, length, _BitCodec(fields, length)
+
+
+def compile_encoder(entries: Sequence[Entry], pack: Callable[..., bytes]) -> Callable[[], bytes]:
+    """What packs the values that the entries have by then; most PDOs carry no more than three."""
+    if len(entries) == 1:
+        (only,) = entries
+        return lambda: pack(only.value)
+    if len(entries) == 2:
+        first, second = entries
+        return lambda: pack(first.value, second.value)
+    if len(entries) == 3:
+        first, second, third = entries
+        return lambda: pack(first.value, second.value, third.value)
+    values = tuple(entries)
+    return lambda: pack(*map(_value_of, values))
 
 
 class _Pdo:
@@ -351,7 +366,8 @@ class ReceivePdo(_Pdo):
 
     def apply(self, data: bytes, now_ns: int) -> None:
         """Write the mapped objects, in the order of the mapping; what its object refuses is left as it was."""
-        for (entry, on_write, is_unlimited), value in zip(self._steps, self._unpack(data)):  # noqa: B905 - as mapped
+        unpack = self._unpack
+        for (entry, on_write, is_unlimited), value in zip(self._steps, unpack(data)):  # noqa: B905 - as mapped
             if not is_unlimited:
                 entry.store(value, now_ns)
             elif on_write is None or on_write(value, now_ns) is None:
@@ -363,6 +379,7 @@ class TransmitPdo(_Pdo):
 
     __slots__ = (
         "_axes",
+        "_encode",
         "_event_entry",
         "_event_ns",
         "_inhibit_entry",
@@ -370,7 +387,6 @@ class TransmitPdo(_Pdo):
         "_is_pending",
         "_last_sources",
         "_outbox",
-        "_pack",
         "_sampled",
         "_sources",
         "_start_entry",
@@ -400,7 +416,7 @@ class TransmitPdo(_Pdo):
         self._inhibit_entry.on_write = self._on_inhibit_time
         self._start_entry.on_write = self._on_start_value
         self._event_entry.on_write = self._on_event_timer
-        self._pack: Callable[..., bytes] = _pack_nothing
+        self._encode: Callable[[], bytes] = _encode_nothing
         self._sources: tuple[Entry, ...] = ()
         self._last_sources: list[Any] = []
         self._inhibit_ns = 0
@@ -416,7 +432,7 @@ class TransmitPdo(_Pdo):
         self.inhibited_until_ns = 0
 
     def _take_codec(self, codec: _Codec) -> None:
-        self._pack = codec.pack
+        self._encode = compile_encoder(self.entries, codec.pack)
         self._sources = tuple(entry for entry in self.entries if in_first_axis(entry.variable.index) not in _MEASURED)
 
     def _start(self, now_ns: int) -> None:
@@ -452,18 +468,22 @@ class TransmitPdo(_Pdo):
 
     def send(self, now_ns: int) -> None:
         """Send the PDO with the values as they are."""
-        self._outbox.append(Frame(self.cob_id, self._pack(*map(_value_of, self.entries))))
+        encode = self._encode
+        self._outbox.append(data_frame(self.cob_id, encode()))
+
+    @property
+    def sync_sender(self) -> Callable[[int], None]:
+        """What it does at a SYNC, as long as its transmission type stays."""
+        return self.send if self.transmission_type == 1 else self.on_sync
 
     def on_sync(self, now_ns: int) -> None:
         """Send at this SYNC if its transmission type says so: 0 after an event, n at every n-th."""
         transmission_type = self.transmission_type
-        if transmission_type == 1:
-            self._outbox.append(Frame(self.cob_id, self._pack(*map(_value_of, self.entries))))
-        elif transmission_type == 0:
+        if transmission_type == 0:
             if self._has_changed():
                 self.send(now_ns)
         elif transmission_type == SYNCHRONOUS_ON_REQUEST:
-            self._sampled = self._pack(*map(_value_of, self.entries))
+            self._sampled = self._encode()
         else:
             self._sync_count += 1
             if self._sync_count >= transmission_type:
@@ -476,7 +496,7 @@ class TransmitPdo(_Pdo):
             self._sample(now_ns)
             self.send(now_ns)
         elif self._sampled is not None:
-            self._outbox.append(Frame(self.cob_id, self._sampled))
+            self._outbox.append(data_frame(self.cob_id, self._sampled))
 
     def poll(self, now_ns: int) -> bool:
         """Event-driven: send if something has changed; gives whether ``due_ns`` may have changed."""
@@ -536,5 +556,5 @@ def _unpack_nothing(data: bytes) -> tuple[Any, ...]:
     return ()
 
 
-def _pack_nothing(*values: Any) -> bytes:
+def _encode_nothing() -> bytes:
     return b""

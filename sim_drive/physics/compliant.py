@@ -302,7 +302,7 @@ class CompliantPlant(FiveBarPlant):
     def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
         """One servo period (1/1024 s) under constant torque commands (N m) for the CV and the servo axis."""
         self._steps += 1
-        if self._torn_at_s is not None:
+        if self.torn_at_s is not None:
             return
         command2, command5 = torque_commands_Nm
         brake2, brake5 = brakes_engaged

@@ -96,7 +96,7 @@ class FiveBarPlant:
     Raises ValueError where the linkage is singular, or does not close, at the initial angles (rad).
     """
 
-    __slots__ = ("_dynamics", "_settings", "_state", "_step_s", "_steps", "_torn_at_s", "_values", "parameters")
+    __slots__ = ("_dynamics", "_settings", "_state", "_step_s", "_steps", "_values", "parameters", "torn_at_s")
 
     def __init__(self, parameters: PlantParameters, theta2_rad: float, theta5_rad: float, state_size: int) -> None:
         self.parameters = parameters
@@ -121,17 +121,13 @@ class FiveBarPlant:
         self._state = np.zeros(state_size)
         self._state[:MOTION_SIZE] = self._values
         self._steps = 0
-        self._torn_at_s: float | None = None
+        self.torn_at_s: float | None = None
+        """Plant time (s) at which the linkage tore, None while it is whole."""
 
     @property
     def axis_count(self) -> int:
         """Two: the CV axis and the servo axis."""
         return 2
-
-    @property
-    def torn_at_s(self) -> float | None:
-        """Plant time (s) at which the linkage tore, None while it is whole."""
-        return self._torn_at_s
 
     @property
     def time_s(self) -> float:
@@ -151,14 +147,14 @@ class FiveBarPlant:
         self._state[:] = 0.0
         self._state[:MOTION_SIZE] = self._values
         self._steps = 0
-        self._torn_at_s = None
+        self.torn_at_s = None
 
     def _take(self, after: tuple[float, float, float, float, float, float, float, float, int]) -> None:
         """Take over what a kernel has answered."""
         self._values = after[:8]
         torn = after[8]
         if torn:
-            self._torn_at_s = (self._steps - 1) * SERVO_PERIOD_S + torn * self._step_s
+            self.torn_at_s = (self._steps - 1) * SERVO_PERIOD_S + torn * self._step_s
 
     def angle(self, axis: int, offset_s: float = 0.0) -> float:
         """Angle in rad, ``offset_s`` after the last servo period (constant acceleration)."""
@@ -201,7 +197,7 @@ class CoupledPlant(FiveBarPlant):
     def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
         """One servo period (1/1024 s) under constant torque commands (N m) for the CV and the servo axis."""
         self._steps += 1
-        if self._torn_at_s is not None:
+        if self.torn_at_s is not None:
             return
         command2, command5 = torque_commands_Nm
         brake2, brake5 = brakes_engaged
