@@ -23,7 +23,7 @@ class Frame(NamedTuple):
         return f"{self.cob_id:03X}#{'R' if self.is_remote else self.data.hex().upper()}"
 
 
-_new: Final[Callable[[type[Frame], tuple[int, bytes, bool]], Frame]] = tuple.__new__
+_new: Final[Callable[[type[Frame], tuple[int, bytes, bool]], Frame]] = tuple.__new__  # pyright: ignore[reportUnknownMemberType, reportUnknownVariableType]
 
 
 def data_frame(cob_id: int, data: bytes) -> Frame:
