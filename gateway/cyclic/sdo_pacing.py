@@ -14,37 +14,33 @@ class SdoPacing:
     A reserve of one frame is a request every other cycle. Everything else passes at once.
     """
 
-    __slots__ = ("_cycle", "_cycles_apart", "_left", "_requests_a_cycle", "_waiting")
+    __slots__ = ("_cycle", "_cycles_apart", "_left", "_requests_a_cycle", "waiting")
 
     def __init__(self, frames_a_cycle: int) -> None:
         self._requests_a_cycle: Final = max(1, frames_a_cycle // 2)
         self._cycles_apart: Final = 1 if frames_a_cycle > 1 else 2
-        self._waiting: deque[Frame] = deque()
+        self.waiting: Final[deque[Frame]] = deque()
+        """Requests that wait for a later cycle."""
         self._cycle = -10
         self._left = 0
 
-    @property
-    def is_holding(self) -> bool:
-        """Whether requests wait for a later cycle."""
-        return bool(self._waiting)
-
     def forget(self) -> None:
         """Drop what waits: nobody can be asked any more."""
-        self._waiting.clear()
+        self.waiting.clear()
 
     def release(self, frames: list[Frame], cycle: int | None) -> list[Frame]:
         """What may go now: of ``frames``, and of what was held back before; ``cycle`` None: no cycle runs."""
         if cycle is None:
-            held = list(self._waiting)
-            self._waiting.clear()
+            held = list(self.waiting)
+            self.waiting.clear()
             return held + frames
         passed: list[Frame] = []
         for frame in frames:
             is_request = SDO_REQUEST_BASE < frame.cob_id <= SDO_REQUEST_BASE + MAX_NODE_ID
-            (self._waiting if is_request else passed).append(frame)
+            (self.waiting if is_request else passed).append(frame)
         if not self._cycle <= cycle < self._cycle + self._cycles_apart:
             self._cycle, self._left = cycle, self._requests_a_cycle
-        while self._waiting and self._left:
+        while self.waiting and self._left:
             self._left -= 1
-            passed.append(self._waiting.popleft())
+            passed.append(self.waiting.popleft())
         return passed

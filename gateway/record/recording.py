@@ -218,6 +218,15 @@ class _Backlog:
             self._count = 0
 
 
+def _tracer(put: Callable[[bytes], None], pack: Callable[..., bytes]) -> Callable[[int, Frame], None]:
+    # A function of its own, for it is called for every frame: it looks nothing up.
+    def trace(at_ns: int, frame: Frame) -> None:
+        cob_id, data, is_remote = frame
+        put(pack(at_ns, cob_id, is_remote, len(data), data))
+
+    return trace
+
+
 class RecordingSink:
     """Lets the cyclic loop write a recording directly (``ring.Sink``): for virtual time, where nobody waits."""
 
@@ -231,6 +240,8 @@ class RecordingSink:
         self._frames = bytearray()
         self._put_sample = self._samples.extend
         self._put_frame = self._frames.extend
+        self.trace: Final = _tracer(self._put_frame, FRAME_STRUCT.pack)
+        """Takes one CAN frame from the virtual bus."""
 
     def append(self, *values: float) -> None:
         """Take one sample; see ``ring.Sink``."""
@@ -240,11 +251,6 @@ class RecordingSink:
 
     def append_frame(self, at_ns: int, cob_id: int, data: bytes, is_remote: bool = False) -> None:
         """Take one CAN frame; see ``ring.Sink``."""
-        self._put_frame(self._pack_frame(at_ns, cob_id, is_remote, len(data), data))
-
-    def trace(self, at_ns: int, frame: Frame) -> None:
-        """Take one CAN frame from the virtual bus."""
-        cob_id, data, is_remote = frame
         self._put_frame(self._pack_frame(at_ns, cob_id, is_remote, len(data), data))
 
     def append_event(self, at_ns: int, kind: str, text: str, **data: str | int | float | bool | None) -> None:

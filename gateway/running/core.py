@@ -110,7 +110,7 @@ class GatewayCore:
             return self._lose_frames()
         if frames:
             loop.outbox = []
-        if self.master.outbox or self._sdo_pacing.is_holding:
+        if self.master.outbox or self._sdo_pacing.waiting:
             frames = frames + self._sdo_pacing.release(self.master.outbox, loop.cycle if loop.is_running else None)
             self.master.outbox = []
         return frames

@@ -113,12 +113,12 @@ def test_sdo_is_let_through_a_request_a_cycle_in_order():
     pacing = SdoPacing(2)
     heartbeat = Frame(0x77F, b"\x05")
     assert pacing.release([*requests(3), heartbeat], 7) == [heartbeat, requests(3)[0]]
-    assert pacing.is_holding
+    assert pacing.waiting
     assert pacing.release([], 7) == []
     assert pacing.release(requests(1, 3), 8) == [requests(3)[1]]
     assert pacing.release([], 9) == [requests(3)[2]]
     assert pacing.release([], 10) == requests(1, 3)
-    assert not pacing.is_holding
+    assert not pacing.waiting
     assert pacing.release(requests(2), None) == requests(2), "no cycle, no limit"
 
 
