@@ -45,7 +45,7 @@ def ignore(node: int, event: Event) -> None:
 
 
 def test_gateway_and_machine_are_quiet_only_when_nothing_has_come_of_a_call() -> None:
-    prepared = prepared_run(PAPER.text, 1)
+    prepared = prepared_run(PAPER.text, PAPER.path, 1)
     gateway = Doubted(build_core(PAPER, prepared.cam.profile, prepared.plan, NoSink()))
     machine = build_machine(PAPER)
     doubted = Doubted(machine)
