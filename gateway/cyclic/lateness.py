@@ -188,7 +188,7 @@ def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -
         drives_ns = min(drives_ns, max(0, late.tpdo_ns - late.sync_ns - phase_ns))
     return Evidence(
         off_ns=off_ns,
-        own_excess_ns=max(0, own_ns - (period_ns - phase_ns)),
+        own_excess_ns=0 if spell.processor_ns is None else max(0, own_ns - (period_ns - phase_ns)),
         late_wake_ns=min(off_ns, max(0, late_wake_ns - spell.ready_at_wake_ns)),
         ready_ns=spell.ready_ns or 0,
         extra_switches=spell.extra_switches,

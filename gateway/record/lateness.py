@@ -13,6 +13,7 @@ LATE_DEMAND_KIND: Final = "late_demand"
 """Event of one late demand."""
 LATE_ACCOUNT_KIND: Final = "late_account"
 """Event of all late demands of the run so far."""
+LATE_KINDS: Final = frozenset({LATE_DEMAND_KIND, LATE_ACCOUNT_KIND})
 US: Final = 1000
 
 
@@ -154,13 +155,17 @@ class LateAccount:
         ``missed``: how many the samples count, where that is known; those that the account lacks are not explained.
         """
         total = max(self.missed, missed or 0)
-        parts = [
+        parts = self._parts(cause for cause in Cause if cause in OUTSIDE)
+        own = self._parts(cause for cause in Cause if cause not in OUTSIDE and cause is not Cause.NOT_EXPLAINED)
+        parts.append(f"{total - self.explained} not explained" + (f" (of these {', '.join(own)})" if own else ""))
+        return f"{total}: " + ", ".join(parts) if total else "0"
+
+    def _parts(self, causes: Iterable[Cause]) -> list[str]:
+        return [
             f"{self.counts[cause]} {IN_WORDS[cause]} ({self.spans_us.get(cause, 0) / 1000:.1f} ms)"
-            for cause in Cause
-            if self.counts.get(cause) and cause is not Cause.NOT_EXPLAINED
+            for cause in causes
+            if self.counts.get(cause)
         ]
-        parts.append(f"{total - self.explained} not explained")
-        return f"{total}: " + ", ".join(parts)
 
     def to_event(self) -> dict[str, str | int]:
         """As the event carries it: few bytes, for an event's slot is small."""
@@ -215,8 +220,40 @@ class LateRecord:
     worst: tuple[LateDemand, ...]
     """Of those that were told one by one, the latest first."""
 
+    def to_json(self, missed: int) -> dict[str, Any]:
+        """Stable keys; ``missed``: how many the samples count, so that none can be left out of the account."""
+        account = self.account
+        total = max(missed, account.missed)
+        return {
+            "missed_rpdo_deadline": total,
+            "explained": account.explained,
+            "not_explained": total - account.explained,
+            "verdict": account.verdict(missed),
+            "by_cause": {
+                cause.value: {"count": account.counts.get(cause, 0), "lateness_us": account.spans_us.get(cause, 0)}
+                for cause in Cause
+                if cause in account.counts or cause in account.spans_us
+            },
+            "overruns": account.overruns,
+            "overruns_explained": account.overruns_explained,
+            "worst": [
+                {
+                    "what": demand.what.value,
+                    "cycle": demand.cycle,
+                    "missed_by_us": demand.missed_by_us,
+                    "cause": demand.cause.value,
+                    "is_explained": demand.is_explained,
+                    "shares_us": {cause.value: span for cause, span in demand.shares_us},
+                }
+                for demand in self.worst
+            ],
+        }
 
-def late_record(events: Iterable[Mapping[str, Any]], most: int) -> LateRecord | None:
+
+MOST_SHOWN: Final = 50
+
+
+def late_record(events: Iterable[Mapping[str, Any]], most: int = MOST_SHOWN) -> LateRecord | None:
     """What ``events`` say, with the worst ``most`` demands; None for a run that kept no account."""
     account: LateAccount | None = None
     demands: list[LateDemand] = []

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.record.histograms import CycleCounts, CycleHistograms, Timing, count_cycles
+from gateway.record.lateness import LateRecord, late_record
 from gateway.record.recording import CAM_ATTACHMENT, Recording, RecordingError
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import MISSED_TPDO_MASK, Phase, SampleArray
@@ -167,6 +168,8 @@ class RunReport:
     recording: str
     recording_is_complete: bool
     stopped_by: str
+    late: LateRecord | None = None
+    """Why demands were late; None where nobody kept account of that, as in virtual time."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as a JSON object of stable keys: no NaN, figures rounded to 6 decimals, null for "none"."""
@@ -175,6 +178,7 @@ class RunReport:
             "config": self.constants.config_name,
             **_phase_json(self.steady, self.constants),
             "cycle": _cycle_json(self.cycle),
+            "late": None if self.late is None else self.late.to_json(self.cycle.counts.missed_rpdo_deadline),
             "machine_cycles": self.machine_cycles,
             "by_machine_cycle": self.by_machine_cycle.to_json(self.constants.axis_names),
             "phases": {phase.name.lower(): count for phase, count in self.phase_counts.items()},
@@ -284,11 +288,17 @@ def analyse(recording: Recording) -> RunReport:
         recording=str(recording.path),
         recording_is_complete=recording.is_complete,
         stopped_by=recording.stopped_by,
+        late=late_record(event.data for event in recording.events),
     )
 
 
 def report_of(
-    data: RunData, *, recording: str = "", recording_is_complete: bool = True, stopped_by: str = "unknown"
+    data: RunData,
+    *,
+    recording: str = "",
+    recording_is_complete: bool = True,
+    stopped_by: str = "unknown",
+    late: LateRecord | None = None,
 ) -> RunReport:
     """The figures of prepared samples."""
     return RunReport(
@@ -303,6 +313,7 @@ def report_of(
         recording=recording,
         recording_is_complete=recording_is_complete,
         stopped_by=stopped_by,
+        late=late,
     )
 
 

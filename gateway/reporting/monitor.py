@@ -21,6 +21,7 @@ from rich.text import Text
 from drivers.cia402 import State, state_of
 from gateway.errors import GatewayError
 from gateway.record.histograms import CycleCounts, CycleHistograms, Spread, Timing, count_cycles
+from gateway.record.lateness import LATE_ACCOUNT_KIND, LATE_KINDS, LateAccount
 from gateway.record.ring import RingReader, RunState, attach
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import Phase, SampleArray
@@ -86,10 +87,14 @@ class MonitorView:
     """That this monitor was too slow for; the recorder has its own reader."""
     events: tuple[str, ...]
     """The latest, with their time since the first."""
+    late: LateAccount | None
+    """Why demands were late, of the whole run, as the loop told it last; None while it has not."""
 
     def to_json(self) -> dict[str, Any]:
         """Stable keys; axes by their names."""
         view = asdict(self)
+        late = self.late
+        view["late"] = None if late is None else {**late.to_event(), "verdict": late.verdict()}
         view["axes"] = {axis.name: {k: v for k, v in asdict(axis).items() if k != "name"} for axis in self.axes}
         for key in ("sync_period_deviation_us", "wake_lateness_us"):
             view[key] = dict(zip(("p50", "p99", "max"), view[key], strict=True))
@@ -111,6 +116,7 @@ class Monitor:
         self._is_attached = False
         self._start_ns: int | None = None
         self._events: list[str] = []
+        self._late: LateAccount | None = None
 
     def update(self) -> None:
         """Take in whatever is new."""
@@ -123,6 +129,10 @@ class Monitor:
         self._window = last_cycle(np.concatenate((self._window, samples))[-_MAX_WINDOW:])
         events, _ = self._reader.read_new_events()
         for event in events:
+            if event.data.get("kind") == LATE_ACCOUNT_KIND:
+                self._late = LateAccount.of_event(event.data)
+            if event.data.get("kind") in LATE_KINDS:
+                continue
             at_ns = int(event.data["at_ns"])
             self._start_ns = at_ns if self._start_ns is None else self._start_ns
             since_s = (at_ns - self._start_ns) / 1e9
@@ -153,6 +163,7 @@ class Monitor:
             spreads={timing: self._histograms.spread(timing) for timing in Timing},
             lost_samples=self._lost,
             events=tuple(self._events),
+            late=self._late,
         )
 
 
@@ -288,6 +299,11 @@ def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
         ),
         f"loop {number(view.loop_cpu_us, 1)} µs a cycle",
     )
+    if view.late is not None:
+        late = view.late
+        timing.add_row(
+            "deadlines, why missed", Text(late.verdict(), style="bold red" if late.not_explained else ""), "of the run"
+        )
     parts: list[RenderableType] = [
         head,
         axes,

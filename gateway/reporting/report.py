@@ -5,12 +5,22 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
+from gateway.record.lateness import IN_WORDS, LATE_KINDS, LateKind, late_record
 from gateway.record.recording import Recording, RecordingError, read_recording
 from gateway.reporting import paper_reference as paper
 from gateway.reporting.analysis import RunData, RunReport, cam_of, prepare, report_of
 from gateway.reporting.plots import Plot, plots_of, to_png, to_svg
 from gateway.reporting.report_page import PAGE, STYLE
-from gateway.reporting.report_text import axis_rows, cycle_rows, headline, is_bad, number, point
+from gateway.reporting.report_text import (
+    axis_rows,
+    cycle_rows,
+    headline,
+    is_bad,
+    is_verdict_bad,
+    late_row,
+    number,
+    point,
+)
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
@@ -29,6 +39,7 @@ def write_report(recording_path: Path, out_dir: Path) -> list[Path]:
         recording=str(recording.path),
         recording_is_complete=recording.is_complete,
         stopped_by=recording.stopped_by,
+        late=late_record(event.data for event in recording.events),
     )
     if not len(recording.samples):
         raise RecordingError(recording_path, "holds no cycle to report on")
@@ -62,7 +73,7 @@ def render_page(recording: Recording, data: RunData, report: RunReport, plots: t
         path=figures.get("path", "") + _table_ii(report),
         torque=figures["torque"],
         run=_whole_run_table(report) + figures["run"] + figures["cycles"],
-        timing=_cycle_table(report) + figures["timing"],
+        timing=_cycle_table(report) + _late_table(recording, report) + figures["timing"],
         events=_events(recording),
         about=_about(recording, report),
         config=escape(recording.config_text) or "none was attached",
@@ -168,14 +179,44 @@ def _table_ii(report: RunReport) -> str:
 def _cycle_table(report: RunReport) -> str:
     rows = cycle_rows(report.cycle)
     body = "".join(_row([what, figure], classes=("bad",) if is_bad(what, figure) else ()) for what, figure in rows)
+    verdict = late_row(report)
+    if verdict is not None:
+        body += _row([*verdict], classes=("left bad" if is_verdict_bad(report) else "left",))
     return f'<div class="scroll"><table class="narrow"><tbody>{body}</tbody></table></div>'
 
 
+def _late_table(recording: Recording, report: RunReport) -> str:
+    """The worst late demands, one a row; nothing where there is none."""
+    late = report.late
+    if late is None or not late.worst:
+        return ""
+    start = recording.metadata.start_ns
+    head = _row(["late by", "what", "cycle", "at", "because of", "explained"], "th", ("left", "", "", "left"))
+    body = "".join(
+        _row(
+            [
+                f"{number(demand.missed_by_us)} µs",
+                "demand" if demand.what is LateKind.RPDO_DEADLINE else "SYNC",
+                number(demand.cycle),
+                f"{(demand.at_ns - start) / 1e9:.3f} s",
+                ", ".join(f"{IN_WORDS[cause]} {number(span)} µs" for cause, span in demand.shares_us),
+                "yes" if demand.is_explained else "no",
+            ],
+            classes=("left", "", "", "left", "" if demand.is_explained else "bad"),
+        )
+        for demand in late.worst
+    )
+    title = f"<summary>The {len(late.worst)} latest demands and SYNCs that were told one by one</summary>"
+    table = f'<div class="scroll"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>'
+    return f'<details id="late">{title}{table}</details>'
+
+
 def _events(recording: Recording) -> str:
-    if not recording.events:
+    events = [event for event in recording.events if event.data.get("kind") not in LATE_KINDS]
+    if not events:
         return "<p>None was recorded.</p>"
     start = recording.metadata.start_ns
-    shown = recording.events[:_MAX_EVENTS]
+    shown = events[:_MAX_EVENTS]
     body = "".join(
         _row(
             [
@@ -188,7 +229,7 @@ def _events(recording: Recording) -> str:
         )
         for event in shown
     )
-    more = len(recording.events) - len(shown)
+    more = len(events) - len(shown)
     rest = f"<p>… and {more} more in the recording.</p>" if more > 0 else ""
     return f'<div class="scroll"><table><tbody>{body}</tbody></table></div>{rest}'
 

@@ -158,6 +158,19 @@ def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
     ]
 
 
+def late_row(report: RunReport) -> tuple[str, str] | None:
+    """Why deadlines were missed, as a row of the cycle's table; None where nobody kept account of it."""
+    if report.late is None:
+        return None
+    return "missed RPDO deadlines, and why", report.late.account.verdict(report.cycle.counts.missed_rpdo_deadline)
+
+
+def is_verdict_bad(report: RunReport) -> bool:
+    """Whether a demand was late without its being explained by what is not the gateway's."""
+    missed = report.cycle.counts.missed_rpdo_deadline
+    return report.late is not None and missed > report.late.account.explained
+
+
 def is_bad(what: str, figure: str) -> bool:
     """Whether a row of ``cycle_rows`` counts something that should not have happened, and did."""
     return what in _COUNTED_FAULTS and figure != "0"
@@ -200,6 +213,9 @@ def render_report(report: RunReport) -> RenderableType:
     for what, figure in cycle_rows(report.cycle):
         cycle.add_row(what, Text(figure, style="bold red" if is_bad(what, figure) else ""))
     parts.append(cycle)
+    verdict = late_row(report)
+    if verdict is not None:
+        parts.append(Text(": ".join(verdict), style="bold red" if is_verdict_bad(report) else ""))
     if report.recording:
         parts.append(Text(f"recording: {report.recording}", style="dim"))
     return Group(*parts)
