@@ -153,11 +153,18 @@ def build_learning(config: GatewayConfig, profile: CamProfile, learned: LearnedT
 def _axis_law(config: GatewayConfig, name: str) -> tuple[float, float, float, float]:
     """Proportional, integrating and derivative part, and bound, of an axis."""
     given, axis = config.learning.axes.get(name, LearnedAxisSection()), config.axes[name]
-    gains = controller_gains(axis)
-    rate = gains.derivative_Nms_per_rad + gains.damping_Nms_per_rad
+    loop = axis.position_loop
+    if loop is None:
+        gains = controller_gains(axis)
+        proportional, integrating = gains.proportional_Nm_per_rad, gains.integrating_Nm_per_rad_s
+        rate = gains.derivative_Nms_per_rad + gains.damping_Nms_per_rad
+    else:
+        # The drive's own controller has no say in cyclic synchronous torque.
+        proportional, integrating = loop.proportional_Nm_per_rad, loop.integrating_Nm_per_rad_s
+        rate = loop.derivative_Nms_per_rad
     return (
-        gains.proportional_Nm_per_rad if given.proportional_Nm_per_rad is None else given.proportional_Nm_per_rad,
-        gains.integrating_Nm_per_rad_s if given.integrating_Nm_per_rad_s is None else given.integrating_Nm_per_rad_s,
+        proportional if given.proportional_Nm_per_rad is None else given.proportional_Nm_per_rad,
+        integrating if given.integrating_Nm_per_rad_s is None else given.integrating_Nm_per_rad_s,
         rate if given.derivative_Nms_per_rad is None else given.derivative_Nms_per_rad,
         BOUND_SHARE * axis.rated_torque_Nm if given.bound_Nm is None else given.bound_Nm,
     )

@@ -22,8 +22,8 @@ from typing import Any
 
 from soak_account import LeakWatch, Tally, as_json, table
 from soak_judge import Judge
-from soak_scenario import draw_campaign
-from soak_session import Rig
+from soak_scenario import draw_campaign, gateway_texts
+from soak_session import Rig, Session, prepared_run
 
 NOTE_S = 60.0
 WARM_UP = 6
@@ -40,23 +40,30 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
             session = rig.run(plan)
             judge = Judge(rig, session)
             found = judge.judge()
-            tally.take(seed, session, judge.figures)
+            tally.take(seed, session, judge)
+            is_torn = rig.plant.torn_at_s is not None
             rig.settle(session)
             found += judge.judge_truth()
             if is_telling or found:
-                told = ", ".join(
-                    f"{p.what if is_telling else p.name} in {moment.value} at {(at_ns - session.started_ns) * 1e-9:.4f} s"
-                    for p, moment, at_ns in session.fired
-                )
-                tell = f"session {number}: {session.core.stopped_by.value}, {session.core.failure}; {told or 'nothing'}"
+                tell = f"session {number}: {session.core.stopped_by.value}, {session.core.failure}; {told(session)}"
                 if is_telling:
                     print(tell, judge.figures, sep="\n    ", file=sys.stderr)
             tally.violations += [f"{one} [{tell}] -- {command(seed)}" for one in found]
-            if rig.plant.torn_at_s is not None:
+            if is_torn:
+                # A torn linkage is not mended by hand.
                 break
-    except Exception:  # noqa: BLE001 - whatever it is, it is what is looked for
+    except Exception:
         tally.violations.append(f"exception in session {number} -- {command(seed)}\n{traceback.format_exc()}")
     tally.campaigns += 1
+
+
+def told(session: Session) -> str:
+    """What happened in a session."""
+    texts = [
+        f"{provocation} in {moment.value} at {(at_ns - session.started_ns) * 1e-9:.4f} s"
+        for provocation, moment, at_ns in session.fired
+    ]
+    return ", ".join(texts) or "nothing"
 
 
 def command(seed: int) -> str:
@@ -67,6 +74,10 @@ def command(seed: int) -> str:
 def soak(hours: float, first_seed: int, stride: int, say: Any = None, is_stopping: Any = lambda: False) -> Tally:
     """Campaigns one after the other until so many hours under guard are reached; ``say(tally)`` about once a minute."""
     tally, leaks, seed = Tally(), LeakWatch(), first_seed
+    if hours >= 1.0:
+        # So that what is kept for good is there before anything is counted.
+        for text in gateway_texts():
+            prepared_run(text)
     noted_s, since_s = time.monotonic(), time.process_time()
     while tally.guarded_s < hours * 3600.0 and not is_stopping():
         run_campaign(seed, tally)
@@ -151,14 +162,14 @@ def main() -> int:
         tally = Tally()
         run_campaign(arguments.seed, tally, is_telling=True)
     else:
-        told = 0
+        said: set[str] = set()
 
         def log(tally: Tally) -> None:
-            nonlocal told
             print(progress(tally), file=sys.stderr, flush=True)
-            for violation in tally.violations[told:]:
-                print("  " + violation, file=sys.stderr, flush=True)
-            told = len(tally.violations)
+            for violation in tally.violations:
+                if violation not in said:
+                    print("  " + violation, file=sys.stderr, flush=True)
+            said.update(tally.violations)
             if arguments.json is not None:
                 arguments.json.write_text(json.dumps(as_json(tally), indent=1) + "\n", encoding="utf-8")
 

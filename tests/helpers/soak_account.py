@@ -1,13 +1,14 @@
-"""Keeps account of a soak: hours, episodes by what happened and when, the worst of every figure, and what was left behind."""
+"""Keeps account of a soak: hours, sessions by what happened and when, the worst figures, and what was left behind."""
 
 import gc
 import math
 import os
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from soak_judge import Figures
+from soak_judge import Figures, Judge
+from soak_scenario import Moment
 from soak_session import Session
 
 from gateway.record.sample import Phase
@@ -17,6 +18,9 @@ STANDING = (*IDLE, Phase.STANDSTILL)
 GROWTH_OBJECTS = 200
 GROWTH_KIB = 16 * 1024
 NOTHING = "nothing"
+UNKNOWN = dict.fromkeys(
+    ("least_sine", "running_deg", "cam_deg", "effector_mm", "rest_s", "torque_off_s", "shaft_torque_Nm"), math.nan
+)
 
 
 @dataclass
@@ -85,14 +89,19 @@ class Tally:
     happened: dict[str, Line] = field(default_factory=dict)
     stops: dict[str, Line] = field(default_factory=dict)
     reasons: dict[str, int] = field(default_factory=dict)
+    unheld: dict[str, int] = field(default_factory=dict)
+    """Sessions whose linkage nobody could have held, and why; their figures are in no line."""
     running_deg: Worst = field(default_factory=Worst)
     violations: list[str] = field(default_factory=list)
     grown: dict[str, int] = field(default_factory=dict)
     rss_kib: tuple[int, int] = (0, 0)
     """After the warm-up, and last."""
 
-    def take(self, seed: int, session: Session, figures: Figures) -> None:
+    def take(self, seed: int, session: Session, judge: Judge) -> None:
         self.sessions += 1
+        figures = replace(judge.figures, **UNKNOWN) if judge.unheld else judge.figures
+        if judge.unheld:
+            self.unheld[judge.unheld] = self.unheld.get(judge.unheld, 0) + 1
         for phase, cycles in session.cycles_in.items():
             self.guarded_s += cycles * 1e-3 * (phase not in IDLE)
             self.motion_s += cycles * 1e-3 * (phase not in STANDING)
@@ -113,8 +122,9 @@ class Tally:
         for mine, theirs in ((self.happened, other.happened), (self.stops, other.stops)):
             for key, line in theirs.items():
                 mine.setdefault(key, Line()).merge(line)
-        for reason, count in other.reasons.items():
-            self.reasons[reason] = self.reasons.get(reason, 0) + count
+        for mine, theirs in ((self.reasons, other.reasons), (self.unheld, other.unheld)):
+            for reason, count in theirs.items():
+                mine[reason] = mine.get(reason, 0) + count
         self.running_deg.take_most(other.running_deg.value, other.running_deg.seed)
         self.violations += other.violations
         for name, count in other.grown.items():
@@ -167,8 +177,8 @@ def rss_kib() -> int:
 def table(tally: Tally) -> str:
     """For people."""
     moments = sorted({moment for line in tally.happened.values() for moment in line.by_moment}, key=_order)
-    head = f"{'what happened':22}{'sessions':>9}{'cam deg':>9}{'sine':>7}{'rest s':>8}{'torque off s':>14}{'N m':>7}{'mm':>7}"
-    lines = [head]
+    titles = f"{'cam deg':>9}{'sine':>7}{'rest s':>8}{'torque off s':>14}{'N m':>7}{'mm':>7}"
+    lines = [f"{'what happened':22}{'sessions':>9}{titles}"]
     for title, rows in (("", tally.happened), ("by stop", tally.stops)):
         lines += ["", title] if title else []
         for name, line in sorted(rows.items(), key=lambda row: -row[1].sessions):
@@ -183,12 +193,13 @@ def table(tally: Tally) -> str:
             lines.append(f"{name:22}" + "".join(f"{line.by_moment.get(moment, 0):12d}" for moment in moments))
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(tally.reasons.items(), key=lambda r: -r[1]))
     lines += ["", f"ended by: {reasons}"]
+    unheld = ", ".join(f"{why} {count}" for why, count in tally.unheld.items())
+    lines.append(f"not judged by where the linkage went: {unheld or 'none'}")
+    lines.append(f"from the cam with nothing amiss: at most{_text(tally.running_deg, 6, 2)} deg")
     return "\n".join(lines)
 
 
 def _order(moment: str) -> int:
-    from soak_scenario import Moment
-
     return [member.value for member in Moment].index(moment)
 
 

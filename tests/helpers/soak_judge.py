@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from soak_scenario import IN_MOTION, Mischief, Moment
+from soak_scenario import CV, IN_MOTION, Mischief, Moment
 from soak_session import SECOND, TICK_S, Rig, Session
 
 from config.guard_section import Reaction
@@ -24,18 +24,19 @@ CONTROLLED_BOUND_DEG = 6.0
 QUICK_BOUND_DEG = 20.0
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
-"""With orders, or on the way onto the cam, the demand itself comes nearer to the singular position: and so much more."""
+"""With orders, or on the way onto the cam, the demand itself comes nearer to a singular position; and so much more."""
 STANDING_SINE_LOSS = 0.05
 CONTROLLED_REST_S = 2.5
 QUICK_REST_S = 0.35
-SWINGING_REST_S = 11.0
-"""Of a CV axis without torque and brake."""
 KILLED_REST_S = 0.35
+QUICK_SHOWN_NS = 2_000_000
+"""A sample shows a phase two cycles after the drives were told."""
 TORQUE_OFF_AFTER_REST_S = 1.2
 KILLED_TORQUE_OFF_S = 0.6
 TORQUE_BOUND_NM = 12.0
 TRUTH_BOUND_COUNTS = 8
 BLIND = (FaultKind.FROZEN_RESOLVER, FaultKind.JUMPING_RESOLVER)
+RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
 NO_MOTION_YET = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL)
 MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
 STOPPING = (Mischief.STOP, Mischief.SIGTERM, Mischief.QUICK_STOP, Mischief.KILLED)
@@ -78,6 +79,8 @@ class Judge:
         self.stop_ns = min((at_ns for at_ns in calls if at_ns is not None), default=None)
         self.phases = {phase for _, phase in session.phases}
         self.stop = self._stop()
+        self.unheld = self._unheld()
+        """Why nothing that any gateway does could keep the linkage within the bounds; empty where it can."""
         self.figures = self._measure()
 
     def judge(self) -> list[str]:
@@ -111,7 +114,9 @@ class Judge:
         calm = away[(times_ns >= on_cam) & (times_ns < min(first_ns, self.stop_ns or math.inf, session.ended_ns))]
         running = math.degrees(float(calm.max())) if len(calm) else math.nan
         if self.stop_ns is None:
-            return Figures(self.stop, float(sines[0]), least_sine, running, math.nan, math.nan, math.nan, math.nan, math.nan)
+            return Figures(
+                self.stop, float(sines[0]), least_sine, running, math.nan, math.nan, math.nan, math.nan, math.nan
+            )
         stopped = times_ns >= self.stop_ns
         angles, away = angles[stopped], away[stopped]
         cam_deg = effector_mm = math.nan
@@ -123,11 +128,17 @@ class Judge:
         elif not session.is_law_plain:
             after = [value for at_ns, value in session.off_cam if at_ns >= self.stop_ns]
             cam_deg = math.degrees(max(after, default=math.nan))
+        if self.stop == "quick":
+            # From a controlled stop it may be gone over to a quick one late.
+            quick_ns = next(at_ns for at_ns, phase in session.phases if phase is Phase.QUICK_STOP)
+            angles = angles[times_ns[stopped] >= quick_ns - QUICK_SHOWN_NS]
         moving = np.abs(angles - angles[-1]).max(axis=1) > TWO_COUNTS_RAD
         rest_s = float((np.flatnonzero(moving)[-1] + 1) * TICK_S) if moving.any() else 0.0
         torque_off_s = max((session.powered_until_ns - self.stop_ns) / SECOND, 0.0)
         torque = self._shaft_torque(angles, parameters)
-        return Figures(self.stop, float(sines[0]), least_sine, running, cam_deg, effector_mm, rest_s, torque_off_s, torque)
+        return Figures(
+            self.stop, float(sines[0]), least_sine, running, cam_deg, effector_mm, rest_s, torque_off_s, torque
+        )
 
     @staticmethod
     def _wrapped(angles: Any) -> Any:
@@ -159,19 +170,27 @@ class Judge:
         session = self.session
         if session.killed_ns is None and not session.is_done:
             self._say("the session does not end")
-        if self.rig.machine.plant.torn_at_s is not None:
+        if self.rig.machine.plant.torn_at_s is not None and not self.unheld:
             self._say("the linkage is torn")
         if self.rig.is_powered:
             self._say("a drive has torque after the session")
         angles = np.array(self.rig.plant.angles[-200:])
-        if float(np.abs(angles - angles[-1]).max()) > TWO_COUNTS_RAD and not self._has_broken_brake():
+        if float(np.abs(angles - angles[-1]).max()) > TWO_COUNTS_RAD and not self.unheld:
             self._say("an axis moves after the session")
-        started = [n for n, (_, phase) in enumerate(session.phases) if phase in (Phase.QUICK_STOP, Phase.CONTROLLED_STOP)]
+        started = [
+            n for n, (_, phase) in enumerate(session.phases) if phase in (Phase.QUICK_STOP, Phase.CONTROLLED_STOP)
+        ]
         if started and {Phase.RAMP_UP, Phase.CAM, Phase.APPROACH} & {p for _, p in session.phases[started[0] :]}:
             self._say("motion begins again after a stop")
 
-    def _has_broken_brake(self) -> bool:
-        return any(fault.kind is FaultKind.BROKEN_BRAKE for fault, _ in self.faults)
+    def _unheld(self) -> str:
+        if any(fault.kind is FaultKind.BROKEN_BRAKE for fault, _ in self.faults):
+            # As soon as the drives are without torque, the axis falls.
+            return "broken brake"
+        if any(fault.kind in BLIND and moment in NO_MOTION_YET for fault, moment in self.faults):
+            # An axis that stands, and whose resolver shows no more than that, sinks unseen.
+            return "blind before the motion"
+        return ""
 
     def _judge_outcome(self) -> None:
         session, core = self.session, self.session.core
@@ -191,14 +210,18 @@ class Judge:
         recovers = any(isinstance(e, StepReached) and e.step == "recovering the axes" for e in session.events)
         if recovers and len(recovered) != 2:
             self._say(f"{len(recovered)} of 2 axes told what has become of them")
-        if any(isinstance(e, OrderAnswered) and e.refusal == "" for e in session.events) and not self.fired:
-            self._say("an order was taken that nobody gave")
+        if len(set(map(id, session.events))) != len(session.events):
+            self._say("an event was told twice")
+        answered = sum(isinstance(e, OrderAnswered) for e in session.events)
+        ordered = sum(p.what in ORDERS for p, _, _ in self.fired)
+        if answered != ordered:
+            self._say(f"{answered} answers to {ordered} orders")
 
     def judge_truth(self) -> list[str]:
         """After the machine has been settled: do its drives know where they are, and has the gateway told the truth."""
         found: list[str] = []
         away = self.session.truth_error_counts
-        if away > TRUTH_BOUND_COUNTS:
+        if away > TRUTH_BOUND_COUNTS and not self.unheld:
             found.append(f"a homed axis is {away} counts from where its drive says that it is")
         names = self.rig.config.axis_names
         for event in self.session.events:
@@ -209,39 +232,46 @@ class Judge:
         return found
 
     def _has_restarted(self, node_id: int, since_ns: int) -> bool:
-        kinds = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
         return any(
-            isinstance(p.what, Fault) and p.what.kind in kinds and p.what.node_id == node_id and at_ns >= since_ns
+            isinstance(p.what, Fault) and p.what.kind in RESTARTS and p.what.node_id == node_id and at_ns >= since_ns
             for p, _, at_ns in self.fired
         )
 
     def _judge_linkage(self) -> None:
         figures = self.figures
-        is_blind = any(fault.kind in BLIND and moment in NO_MOTION_YET for fault, moment in self.faults)
         if figures.running_deg > RUNNING_BOUND_DEG:
             self._say(f"{figures.running_deg:.1f} deg from the cam with nothing amiss (bound {RUNNING_BOUND_DEG:g})")
-        if not is_blind:
-            least = LEAST_SINE
-            least = min(least, figures.first_sine - STANDING_SINE_LOSS)
-            if not self.session.is_law_plain or Phase.APPROACH in self.phases:
-                least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
-            if not figures.least_sine > least:
-                self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
+        if self.unheld:
+            return
+        least = min(LEAST_SINE, figures.first_sine - STANDING_SINE_LOSS)
+        if not self.session.is_law_plain or Phase.APPROACH in self.phases:
+            least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
+        if not figures.least_sine > least:
+            self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
         if self.stop == "none":
             return
-        jumps = sum(abs(f.counts or 0) for f, _ in self.faults if f.kind is FaultKind.JUMPING_RESOLVER)
-        bound = (CONTROLLED_BOUND_DEG if self.stop == "controlled" else QUICK_BOUND_DEG) + jumps * 360.0 / 4096
-        if figures.cam_deg > bound and not is_blind:
+        bound = (CONTROLLED_BOUND_DEG if self.stop == "controlled" else QUICK_BOUND_DEG) + self._jumped_deg()
+        if figures.cam_deg > bound:
             self._say(f"{figures.cam_deg:.1f} deg from the cam in a {self.stop} stop (bound {bound:.1f})")
         rest = {"controlled": CONTROLLED_REST_S, "quick": QUICK_REST_S, "killed": KILLED_REST_S}[self.stop]
-        rest = SWINGING_REST_S if self._has_broken_brake() else rest
         if figures.rest_s > rest:
             self._say(f"at rest {figures.rest_s:.2f} s after a {self.stop} stop was called for (bound {rest:g})")
         off = KILLED_TORQUE_OFF_S if self.stop == "killed" else rest + TORQUE_OFF_AFTER_REST_S
         if figures.torque_off_s > off:
-            self._say(f"without torque {figures.torque_off_s:.2f} s after a {self.stop} stop was called for (bound {off:g})")
+            self._say(
+                f"without torque {figures.torque_off_s:.2f} s after a {self.stop} stop was called for (bound {off:g})"
+            )
         if figures.shaft_torque_Nm > TORQUE_BOUND_NM:
             self._say(f"{figures.shaft_torque_Nm:.1f} N m on a shaft in a {self.stop} stop (bound {TORQUE_BOUND_NM:g})")
+
+    def _jumped_deg(self) -> float:
+        """How far drives whose resolvers jumped have carried their links before anybody could know."""
+        slope = float(np.abs(self.session.prepared.cam.profile.at_many(np.linspace(0.0, math.tau, 360))[:, 1]).max())
+        return sum(
+            abs(fault.counts or 0) * 360.0 / 4096 * (slope if fault.node_id == CV else 1.0)
+            for fault, _ in self.faults
+            if fault.kind is FaultKind.JUMPING_RESOLVER
+        )
 
     def _least_commanded_sine(self) -> float:
         """Of the way that was demanded, wherever it led."""

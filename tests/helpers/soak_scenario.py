@@ -1,10 +1,10 @@
-"""What happens in a soak, drawn from a seed: a machine, the sessions that it goes through, and what goes wrong in them."""
+"""What happens in a soak, drawn from a seed: a machine, its sessions one after the other, and what goes wrong in them."""
 
+import itertools
 import os
 import tempfile
 from dataclasses import dataclass
 from enum import Enum, unique
-from functools import lru_cache
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -18,7 +18,7 @@ from drivers import objects
 from gateway.cyclic.guard import Condition
 from gateway.cyclic.operation import Order
 from gateway.running.preparation import compile_config
-from sim_drive.injection.faults import Direction, Fault, FaultKind
+from sim_drive.injection.faults import PARAMETERS, Direction, Fault, FaultKind
 
 CV, SERVO = 1, 2
 PAPER = load_config("paper")
@@ -101,6 +101,13 @@ class Provocation:
         """Of the kind, for tables."""
         return self.what.kind.value if isinstance(self.what, Fault) else self.what.value
 
+    def __str__(self) -> str:
+        if not isinstance(self.what, Fault):
+            return f"{self.name} ({self.value:g})" if self.value else self.name
+        given = {key: getattr(self.what, key) for key in ("node_id", "for_s", *PARAMETERS)}
+        values = (f"{key}={getattr(value, 'value', value)}" for key, value in given.items() if value is not None)
+        return f"{self.name} ({', '.join(values)})"
+
 
 @dataclass(frozen=True, slots=True)
 class SessionPlan:
@@ -127,20 +134,35 @@ class Campaign:
 def draw_campaign(seed: int) -> Campaign:
     """The campaign of a seed."""
     source = Random(seed)
-    document = yaml.safe_load(PAPER.text)
-    document["motion"]["speed_rpm"] = rpm = source.choice((60, 60, 60, 60, 45, 30))
-    document["motion"]["curve"] = source.choice(
-        ("desired_path.csv", "desired_path.csv", "desired_path_36.csv", str(_smaller_curve(0.8)))
+    document = _document(
+        source.choice((60, 60, 60, 60, 45, 30)),
+        source.choice((CURVES[0], *CURVES)),
+        source.random() < 0.2,
+        source.random() < 0.2,
     )
-    if source.random() < 0.2:
-        document["learning"] = {"enabled": True}
-    if source.random() < 0.2:
-        for name, gains in TORQUE_LOOPS.items():
-            document["axes"][name]["position_loop"] = gains
+    rpm = document["motion"]["speed_rpm"]
     gateway_text = yaml.safe_dump(document)
     _make_otherwise(document, source)
     sessions = tuple(_draw_session(source, rpm) for _ in range(source.randint(5, 10)))
     return Campaign(seed, gateway_text, yaml.safe_dump(document), source.choice((0.0, 0.1, 0.2)), sessions)
+
+
+def _document(rpm: int, curve: Path, is_learning: bool, is_torque_controlled: bool) -> dict[str, Any]:
+    document = yaml.safe_load(PAPER.text)
+    document["motion"]["speed_rpm"] = rpm
+    document["motion"]["curve"] = str(curve)
+    if is_learning:
+        document["learning"] = {"enabled": True}
+    if is_torque_controlled:
+        for name, gains in TORQUE_LOOPS.items():
+            document["axes"][name]["position_loop"] = gains
+    return document
+
+
+def gateway_texts() -> list[str]:
+    """Every configuration of a gateway that a campaign may draw."""
+    ways = itertools.product((60, 45, 30), CURVES, (False, True), (False, True))
+    return [yaml.safe_dump(_document(*way)) for way in ways]
 
 
 TORQUE_LOOPS = {
@@ -160,7 +182,7 @@ TORQUE_LOOPS = {
 
 
 def _make_otherwise(document: dict[str, Any], source: Random) -> None:
-    """The machine is another one than the gateway's model: masses and friction by up to 10 and 20 %, noisy resolvers."""
+    """The machine is not the gateway's model: masses and friction by up to 10 and 20 %, noisy resolvers."""
     masses, friction = source.uniform(0.9, 1.1), source.uniform(0.8, 1.2)
     for link in document["machine"]["links"].values():
         link["mass_kg"] *= masses
@@ -173,7 +195,6 @@ def _make_otherwise(document: dict[str, Any], source: Random) -> None:
         emulation["resolver_eccentricity_counts"] = source.choice((0.0, 0.0, 2.0))
 
 
-@lru_cache(maxsize=4)
 def _smaller_curve(share: float) -> Path:
     """The curve that the end effector traces if the servo makes the paper's motion times ``share``."""
     cam, curve = compile_config(PAPER), desired_curve(PAPER)
@@ -187,6 +208,9 @@ def _smaller_curve(share: float) -> Path:
     new.write_text("\n".join(("theta2_deg,x_mm,y_mm", *lines)) + "\n", encoding="utf-8")
     new.replace(path)
     return path
+
+
+CURVES = (Path("desired_path.csv"), Path("desired_path_36.csv"), _smaller_curve(0.8))
 
 
 def _draw_session(source: Random, rpm: float) -> SessionPlan:
@@ -282,9 +306,7 @@ def _parameters(source: Random, kind: FaultKind, node: int) -> dict[str, Any]:
         case FaultKind.SLOW_SDO:
             return {"delay_s": source.uniform(0.001, 0.3)}
         case FaultKind.SDO_ABORT:
-            index = source.choice(
-                (objects.MODES_OF_OPERATION, objects.IDENTITY, objects.PRODUCER_HEARTBEAT_TIME)
-            )
+            index = source.choice((objects.MODES_OF_OPERATION, objects.IDENTITY, objects.PRODUCER_HEARTBEAT_TIME))
             return {"index": index}
         case FaultKind.WRONG_IDENTITY:
             return {"vendor_id": 7}

@@ -3,7 +3,7 @@
 import heapq
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from random import Random
 from typing import Any
@@ -18,6 +18,7 @@ from drivers.virtual_time import VirtualBus
 from gateway.record.sample import Phase
 from gateway.running.core import GatewayCore, StepReached
 from gateway.running.preparation import PreparedRun, build_core, prepare
+from gateway.running.preparation import plan as plan_of_run
 from gateway.running.recovery import AxisRecovered
 from sim_drive.assembly import build_machine
 from sim_drive.injection.faults import Fault
@@ -45,10 +46,10 @@ MOMENT_OF_PHASE = {
 MOMENT_OF_STEP = {"enabling the axes": Moment.ENABLING, "recovering the axes": Moment.RECOVERY}
 
 
-@lru_cache(maxsize=128)
-def prepared_run(text: str, cycles: int) -> PreparedRun:
-    """A gateway's run; there are few configurations, and they come back."""
-    return prepare(parse_config(text, PAPER.path), cycles)
+@lru_cache(maxsize=64)
+def prepared_run(text: str) -> PreparedRun:
+    """A gateway's run of one machine cycle; there are few configurations, and they come back."""
+    return prepare(parse_config(text, PAPER.path), 1)
 
 
 class WatchedPlant:
@@ -168,7 +169,8 @@ class Rig:
     def run(self, plan: SessionPlan) -> Session:
         """Carry out one session, and look on for a while."""
         self.plant.angles.clear()
-        prepared = prepared_run(self.config.text, plan.machine_cycles)
+        prepared = prepared_run(self.config.text)
+        prepared = replace(prepared, plan=plan_of_run(self.config, plan.machine_cycles))
         session = Session(plan, prepared, self.now_ns, 0, self.is_ready, None)  # type: ignore[arg-type]
         session.core = core = build_core(
             self.config,
@@ -300,9 +302,7 @@ class Conductor:
             session.off_cam.append((self.bus.now_ns, abs(math.remainder(theta5 - law.at(theta2)[0], math.tau))))
         if self.rig.is_powered:
             session.powered_until_ns = self.bus.now_ns
-        self.rig.plant.drift(
-            self.rig.campaign.friction_drift * math.sin(math.tau * self.bus.now_ns / (20 * SECOND))
-        )
+        self.rig.plant.drift(self.rig.campaign.friction_drift * math.sin(math.tau * self.bus.now_ns / (20 * SECOND)))
 
     def _reach(self, moment: Moment) -> None:
         self.moment = moment

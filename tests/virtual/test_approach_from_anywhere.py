@@ -51,7 +51,7 @@ class Again:
         assert self.machine.plant.torn_at_s is None
         assert math.degrees(math.remainder(self.machine.plant.angle(0), math.tau)) == pytest.approx(0.0, abs=1.5)
         # On the slow way no axis is faster than it may be: 0.5 rad/s are 0.33 counts a cycle, so one at most.
-        demands = [sample[13:15] for sample, phase in zip(self.samples, phases, strict=True) if phase is Phase.APPROACH]
+        demands = [sample[14:16] for sample, phase in zip(self.samples, phases, strict=True) if phase is Phase.APPROACH]
         steps = [abs(b - a) for one, two in itertools.pairwise(demands) for a, b in zip(one, two, strict=True)]
         assert max(steps) <= 1
 

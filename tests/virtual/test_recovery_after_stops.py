@@ -7,7 +7,7 @@ from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
 from test_approach_from_anywhere import Again
 
 from drivers.cia402 import State, state_of
-from drivers.master import BootUpReceived
+from drivers.master import BootUpReceived, EmergencyReceived
 from gateway.record.sample import Phase
 from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
@@ -57,6 +57,7 @@ def test_a_fault_is_reset_by_one_edge_and_the_run_may_begin_anew_from_there():
     steps = [event.step for event in run.events if isinstance(event, StepReached)]
     assert steps[-3:] == ["disabling the axes", "recovering the axes", "done"]
     assert_at_rest(run)
+    assert [e.code for e in run.events if isinstance(e, EmergencyReceived) and e.node_id == SERVO] == [0x2310, 0]
     Again(run).to_end().assert_approached_and_ran_home()
 
 
