@@ -18,10 +18,12 @@ from mechanism.dynamics import inverse_dynamics_along
 from sim_drive.injection.faults import TRIPS, Fault, FaultKind
 
 TWO_COUNTS_RAD = 2.0 * math.tau / 4096
-RUNNING_BOUND_DEG = 4.0
-"""From the cam in motion, before anything has happened."""
-CONTROLLED_BOUND_DEG = 6.0
+RUNNING_BOUND_DEG = 1.5
+"""From the cam once the machine is at speed, before anything has happened."""
+CONTROLLED_BOUND_DEG = 3.0
 QUICK_BOUND_DEG = 20.0
+QUICK_OF_TWO_BOUND_DEG = 30.0
+"""If something else has gone wrong as well."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
 """With orders, or on the way onto the cam, the demand itself comes nearer to a singular position; and so much more."""
@@ -33,7 +35,7 @@ QUICK_SHOWN_NS = 2_000_000
 """A sample shows a phase two cycles after the drives were told."""
 TORQUE_OFF_AFTER_REST_S = 1.2
 KILLED_TORQUE_OFF_S = 0.6
-TORQUE_BOUND_NM = 12.0
+TORQUE_BOUND_NM = 10.0
 TRUTH_BOUND_COUNTS = 8
 BLIND = (FaultKind.FROZEN_RESOLVER, FaultKind.JUMPING_RESOLVER)
 RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
@@ -53,7 +55,7 @@ class Figures:
     """Where the session began."""
     least_sine: float
     running_deg: float
-    """Greatest distance of link s from the cam of link p's true angle, before the first provocation."""
+    """Greatest distance of link s from the cam of link p's true angle, at speed, before the first provocation."""
     cam_deg: float
     """The same from the first call for a stop on."""
     effector_mm: float
@@ -111,7 +113,8 @@ class Judge:
         away = np.abs(self._wrapped(angles[:, 1] - session.prepared.cam.profile.at_many(angles[:, 0])[:, 0]))
         on_cam = self._on_cam_from_ns()
         first_ns = min((at_ns for _, _, at_ns in self.fired), default=math.inf)
-        calm = away[(times_ns >= on_cam) & (times_ns < min(first_ns, self.stop_ns or math.inf, session.ended_ns))]
+        at_speed = next((at_ns for at_ns, phase in session.phases if phase is Phase.CAM), math.inf)
+        calm = away[(times_ns >= at_speed) & (times_ns < min(first_ns, self.stop_ns or math.inf, session.ended_ns))]
         running = math.degrees(float(calm.max())) if len(calm) else math.nan
         if self.stop_ns is None:
             return Figures(
@@ -250,7 +253,8 @@ class Judge:
             self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
         if self.stop == "none":
             return
-        bound = (CONTROLLED_BOUND_DEG if self.stop == "controlled" else QUICK_BOUND_DEG) + self._jumped_deg()
+        quick = QUICK_BOUND_DEG if len(self.fired) < 2 else QUICK_OF_TWO_BOUND_DEG
+        bound = (CONTROLLED_BOUND_DEG if self.stop == "controlled" else quick) + self._jumped_deg()
         if figures.cam_deg > bound:
             self._say(f"{figures.cam_deg:.1f} deg from the cam in a {self.stop} stop (bound {bound:.1f})")
         rest = {"controlled": CONTROLLED_REST_S, "quick": QUICK_REST_S, "killed": KILLED_REST_S}[self.stop]

@@ -1,4 +1,4 @@
-"""What happens in a soak, drawn from a seed: a machine, its sessions one after the other, and what goes wrong in them."""
+"""What happens in a soak, drawn from a seed: a machine, its sessions one after the other, what goes wrong in them."""
 
 import itertools
 import os

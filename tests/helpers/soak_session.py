@@ -295,11 +295,13 @@ class Conductor:
             degrees = math.degrees(core.loop._demand.master_position) % 360.0  # type: ignore[union-attr]
             if RETURN_STROKE_DEG[0] < degrees < RETURN_STROKE_DEG[1]:
                 self._arm(Moment.RETURN_STROKE)
-        law = core.operation._demand.law  # type: ignore[union-attr]
-        if not law.is_plain and Phase.RAMP_UP <= phase <= Phase.QUICK_STOP:
+        law, demand = core.operation._demand.law, core.loop._demand  # type: ignore[union-attr]
+        if not law.is_plain and demand is not None and Phase.RAMP_UP <= phase <= Phase.QUICK_STOP:
             session.is_law_plain = False
-            theta2, theta5 = self.rig.plant.angle(0), self.rig.plant.angle(1)
-            session.off_cam.append((self.bus.now_ns, abs(math.remainder(theta5 - law.at(theta2)[0], math.tau))))
+            # The law counts whole turns as the demand does.
+            theta2 = demand.master_position + math.remainder(self.rig.plant.angle(0) - demand.master_position, math.tau)
+            away = math.remainder(self.rig.plant.angle(1) - law.at(theta2)[0], math.tau)
+            session.off_cam.append((self.bus.now_ns, abs(away)))
         if self.rig.is_powered:
             session.powered_until_ns = self.bus.now_ns
         self.rig.plant.drift(self.rig.campaign.friction_drift * math.sin(math.tau * self.bus.now_ns / (20 * SECOND)))
