@@ -43,6 +43,8 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
             tally.take(seed, session, judge)
             is_torn = rig.plant.torn_at_s is not None
             rig.settle(session)
+            # A linkage that nobody could hold may stand where no run can begin.
+            rig.is_ready = not judge.unheld
             found += judge.judge_truth()
             if is_telling or found:
                 tell = f"session {number}: {session.core.stopped_by.value}, {session.core.failure}; {told(session)}"

@@ -163,6 +163,7 @@ class Rig:
         self.injector = Injector(self.machine, (), campaign.seed)
         self.now_ns = 0
         self.is_ready = True
+        """A run may begin where the linkage stands."""
         self.is_homing_again = False
         self._source = Random(campaign.seed)
 
@@ -225,10 +226,9 @@ class Rig:
         self._look_on(None, 0.5)
         session.truth_error_counts = self._truth_error()
         outcomes = [event for event in session.events if isinstance(event, AxisRecovered)]
-        self.is_ready = session.core.failure is None and all(event.is_ready for event in outcomes)
         session.unhomed = tuple(n for n, axis in enumerate(self.machine.drive_axes) if not axis.is_homed)
-        self.is_homing_again = not self.is_ready or bool(session.unhomed)
-        self.is_ready = True
+        is_ready = session.core.failure is None and all(event.is_ready for event in outcomes)
+        self.is_homing_again = not is_ready or bool(session.unhomed)
         if self.is_homing_again:
             turns = round(self.plant.angle(0) / math.tau) * math.tau
             self.plant.set_motion((turns, 0.0), (0.0, 0.0))
