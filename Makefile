@@ -1,10 +1,13 @@
 # Two commands: `make demo` and `make test`. Both make the virtual environment first; nothing else is needed but
 # Python 3.11 or newer (name another with PYTHON=python3.12).
 PYTHON ?= python3
+# Of `make soak`: machine hours, and the processes that share them.
+HOURS ?= 24
+PROCESSES ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint vcan slow bench clean
+.PHONY: demo test lint vcan slow bench soak clean
 
 demo: $(VENV)/installed
 	$(BIN)/drive-gateway demo
@@ -39,6 +42,9 @@ $(VENV)/installed: $(VENV)/bin/python pyproject.toml
 $(VENV)/installed-dev: $(VENV)/installed
 	$(BIN)/python -m pip install --quiet --group dev
 	touch $@
+
+soak: $(VENV)/installed-dev
+	$(BIN)/python tests/helpers/soak.py --hours $(HOURS) --processes $(PROCESSES) --json soak.json
 
 clean:
 	rm -rf $(VENV)

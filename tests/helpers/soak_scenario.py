@@ -143,7 +143,7 @@ def draw_campaign(seed: int) -> Campaign:
     rpm = document["motion"]["speed_rpm"]
     gateway_text = yaml.safe_dump(document)
     _make_otherwise(document, source)
-    sessions = tuple(_draw_session(source, rpm) for _ in range(source.randint(5, 10)))
+    sessions = tuple(draw_session(source, rpm) for _ in range(source.randint(5, 10)))
     return Campaign(seed, gateway_text, yaml.safe_dump(document), source.choice((0.0, 0.1, 0.2)), sessions)
 
 
@@ -213,7 +213,8 @@ def _smaller_curve(share: float) -> Path:
 CURVES = (Path("desired_path.csv"), Path("desired_path_36.csv"), _smaller_curve(0.8))
 
 
-def _draw_session(source: Random, rpm: float) -> SessionPlan:
+def draw_session(source: Random, rpm: float) -> SessionPlan:
+    """One session; ``rpm``: the speed of its run."""
     cycles = source.choice((1, 1, 2, 2, 3, 5))
     happens: list[Provocation] = []
     if source.random() < 0.3:

@@ -23,19 +23,24 @@ LOOPS = {
 SAMPLE = SampleLayout(PAPER.axis_names)
 
 
-def machine_with(*axes):
+def machine_with(*axes, is_learning=False):
     document = yaml.safe_load(PAPER.text)
     for name in axes:
         document["axes"][name]["position_loop"] = {**LOOPS[name], "torque_limit_Nm": 4.5}
+    if is_learning:
+        document["learning"] = {"enabled": True}
+        document["motion"]["speed_rpm"] = 30
+        for axis in document["axes"].values():
+            axis["emulation"]["resolver_noise_counts"] = 0.3
     return parse_config(yaml.safe_dump(document), PAPER.path)
 
 
 class Run:
     """One session against the emulated machine, with faults; ``samples`` as they would be recorded."""
 
-    def __init__(self, config, *faults):
+    def __init__(self, config, *faults, cycles=2):
         self.packed = bytearray()
-        prepared = prepare(config, 2)
+        prepared = prepare(config, cycles)
         self.machine = build_machine(config, 1)
         self.core = build_core(config, prepared.cam.profile, prepared.plan, self)
         self.modes = set()
@@ -76,6 +81,15 @@ def test_the_machine_runs_on_its_cam_under_the_gateways_own_loops(axes, modes):
     assert cv <= 2
     assert servo <= 4
     assert not any(drive.is_powered for drive in run.machine.drives)
+
+
+def test_learning_goes_by_the_loop_that_the_gateway_closes():
+    """With the drives' own gains, which have no say in this mode, the axes swing up from cycle to cycle."""
+    run = Run(machine_with("cv", "servo", is_learning=True), cycles=8)
+    assert run.core.learned is not None
+    cv, servo = run.errors
+    assert cv <= 3
+    assert servo <= 4
 
 
 @pytest.mark.parametrize(
