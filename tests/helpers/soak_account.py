@@ -135,7 +135,9 @@ class Tally:
 class LeakWatch:
     """Counts objects by their type, and the process' memory, between two campaigns, when no machine is alive."""
 
-    def __init__(self) -> None:
+    def __init__(self, objects: int = GROWTH_OBJECTS) -> None:
+        """``objects``: so many more of a type are not yet a leak."""
+        self._objects = objects
         self._counts: list[Counter[str]] = []
         self._rss_kib: list[int] = []
 
@@ -157,7 +159,7 @@ class LeakWatch:
         grown: dict[str, int] = {}
         for name in set().union(*last):
             more = min(counts[name] for counts in last) - max(counts[name] for counts in first)
-            if more > GROWTH_OBJECTS:
+            if more > self._objects:
                 grown[name] = more
         if third > 1 and min(self._rss_kib[-third:]) - max(self._rss_kib[:third]) > GROWTH_KIB:
             grown["memory, KiB"] = min(self._rss_kib[-third:]) - max(self._rss_kib[:third])
