@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from soak_scenario import CV, IN_MOTION, Mischief, Moment
+from soak_scenario import CV, IN_MOTION, ORDER_OF, Mischief, Moment
 from soak_session import SECOND, TICK_S, Rig, Session
 
 from config.guard_section import Reaction
 from gateway.cyclic.guard import GuardTripped, StopReason
 from gateway.cyclic.operation import OrderAnswered
 from gateway.record.sample import Phase
-from gateway.running.core import StepReached
+from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
 from mechanism.dynamics import inverse_dynamics_along
 from sim_drive.injection.faults import TRIPS, Fault, FaultKind
@@ -42,7 +42,7 @@ RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
 NO_MOTION_YET = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL)
 MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
 STOPPING = (Mischief.STOP, Mischief.SIGTERM, Mischief.QUICK_STOP, Mischief.KILLED)
-ORDERS = (Mischief.OVERRIDE, Mischief.JOG, Mischief.PHASE_SHIFT, Mischief.DISENGAGE, Mischief.ENGAGE)
+ORDERS = tuple(ORDER_OF)
 
 
 @dataclass(frozen=True, slots=True)

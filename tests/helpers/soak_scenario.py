@@ -65,6 +65,8 @@ class Mischief(Enum):
     """The gateway's process gets no processor for a while."""
     HOST_LATE = "host late"
     """Everything that it sends comes a cycle late."""
+    CONTROLLER_OFF = "controller off"
+    """The gateway's own controller goes bus-off, and comes back."""
     KILLED = "gateway killed"
     STOP = "operator stop"
     SIGTERM = "sigterm"
@@ -74,6 +76,7 @@ class Mischief(Enum):
     PHASE_SHIFT = "phase shift"
     DISENGAGE = "disengage"
     ENGAGE = "engage"
+    WINDOW = "window"
 
 
 ORDER_OF = {
@@ -82,6 +85,7 @@ ORDER_OF = {
     Mischief.PHASE_SHIFT: Order.PHASE_SHIFT,
     Mischief.DISENGAGE: Order.DISENGAGE,
     Mischief.ENGAGE: Order.ENGAGE,
+    Mischief.WINDOW: Order.WINDOW,
 }
 WISH_OF = {Mischief.STOP: Condition.OPERATOR_STOP, Mischief.SIGTERM: Condition.SIGTERM}
 
@@ -94,7 +98,7 @@ class Provocation:
     delay_s: float
     what: Fault | Mischief
     value: float = 0.0
-    """Of an order in its own unit; of a host that is away or late for how long, s."""
+    """Of an order in its own unit; for how long a host is away or late, or a controller off, s."""
 
     @property
     def name(self) -> str:
@@ -245,8 +249,8 @@ def _draw_orders(source: Random, cycle_s: float) -> list[Provocation]:
 
     match source.randrange(4):
         case 0:
-            slow = source.uniform(10.0, 90.0)
-            return [order(0.0, Mischief.OVERRIDE, slow), order(source.uniform(0.3, 2.0), Mischief.OVERRIDE, 100.0)]
+            other = source.uniform(10.0, 125.0)
+            return [order(0.0, Mischief.OVERRIDE, other), order(source.uniform(0.3, 2.0), Mischief.OVERRIDE, 100.0)]
         case 1:
             rpm = source.choice((-1.0, 1.0)) * source.uniform(1.0, 7.0)
             jog_s = 1.8 + source.uniform(0.0, 1.0)
@@ -261,7 +265,11 @@ def _draw_orders(source: Random, cycle_s: float) -> list[Provocation]:
             return [order(0.0, Mischief.PHASE_SHIFT, source.uniform(-8.0, 8.0)), order(back_s, Mischief.PHASE_SHIFT, 0)]
         case _:
             leave, back = source.uniform(150.0, 220.0), source.uniform(150.0, 220.0)
-            return [order(0.0, Mischief.DISENGAGE, leave), order(1.3 * cycle_s, Mischief.ENGAGE, back)]
+            return [
+                order(0.0, Mischief.WINDOW, source.choice((0.0, 40.0, 60.0, 90.0))),
+                order(0.03, Mischief.DISENGAGE, leave),
+                order(1.3 * cycle_s, Mischief.ENGAGE, back),
+            ]
 
 
 def _draw_provocation(source: Random, moment: Moment, delay_s: float) -> Provocation:
@@ -274,10 +282,12 @@ def _draw_provocation(source: Random, moment: Moment, delay_s: float) -> Provoca
                 Mischief.QUICK_STOP,
                 Mischief.HOST_AWAY,
                 Mischief.HOST_LATE,
+                Mischief.CONTROLLER_OFF,
+                Mischief.CONTROLLER_OFF,
                 Mischief.KILLED,
             )
         )
-        return Provocation(moment, delay_s, what, source.choice((0.004, 0.015, 0.03, 0.06)))
+        return Provocation(moment, delay_s, what, source.choice((0.004, 0.015, 0.03, 0.06, 0.15, 0.5)))
     return Provocation(moment, delay_s, _draw_fault(source, moment))
 
 

@@ -12,12 +12,16 @@ from soak_scenario import ORDER_OF, PAPER, WISH_OF, Campaign, Mischief, Moment, 
 
 from config.loading import parse_config
 from config.schema import GatewayConfig
+from drivers.controller import ControllerChanged
+from drivers.controller_outage import ControllerOutage
 from drivers.frame import Frame
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
 from gateway.record.sample import Phase
-from gateway.running.core import GatewayCore, StepReached
-from gateway.running.preparation import PreparedRun, build_core, prepare
+from gateway.running.assembly import build_core
+from gateway.running.core import GatewayCore
+from gateway.running.machine_session import StepReached
+from gateway.running.preparation import PreparedRun, prepare
 from gateway.running.preparation import plan as plan_of_run
 from gateway.running.recovery import AxisRecovered
 from sim_drive.assembly import build_machine
@@ -81,6 +85,15 @@ class WatchedPlant:
         self.plant._settings[:, :2] = self._friction * (1.0 + share)
 
 
+class Cable(ControllerOutage):
+    """The gateway's core, or its host, on a bus that it loses when told to."""
+
+    def lose(self, now_ns: int, for_ns: int) -> None:
+        """The controller goes off now, and is back after that time; if it is not off already."""
+        if not self._turns:
+            self._turns += [now_ns, now_ns + for_ns]
+
+
 class HostedCore:
     """The gateway's core on a host that may be away, or late with all that it sends."""
 
@@ -101,6 +114,9 @@ class HostedCore:
     def wake(self, now_ns: int) -> None:
         self.core.wake(now_ns)
         self._be_late(now_ns)
+
+    def controller_changed(self, change: ControllerChanged) -> None:
+        self.core.controller_changed(change)
 
     def _be_late(self, now_ns: int) -> None:
         if now_ns < self.late_until_ns:
@@ -182,9 +198,11 @@ class Rig:
             approach_cycles=plan.machine_cycles,
         )
         host = HostedCore(core)
-        is_hosted = any(p.what in (Mischief.HOST_AWAY, Mischief.HOST_LATE) for p in plan.provocations)
-        bus = self._bus(host if is_hosted else core, session.events)
-        Conductor(self, session, bus, host).conduct()
+        planned = {p.what for p in plan.provocations if isinstance(p.what, Mischief)}
+        node: Any = host if planned & {Mischief.HOST_AWAY, Mischief.HOST_LATE} else core
+        cable = Cable(node, ())
+        bus = self._bus(cable if Mischief.CONTROLLER_OFF in planned else node, session.events)
+        Conductor(self, session, bus, host, cable).conduct()
         self.now_ns = bus.now_ns
         session.ended_ns = self.now_ns
         session.is_done = core.is_done
@@ -251,8 +269,8 @@ class Rig:
 class Conductor:
     """Lets a session run, and has happen in it what its plan says, at its moments."""
 
-    def __init__(self, rig: Rig, session: Session, bus: VirtualBus, host: HostedCore) -> None:
-        self.rig, self.session, self.bus, self.host = rig, session, bus, host
+    def __init__(self, rig: Rig, session: Session, bus: VirtualBus, host: HostedCore, cable: Cable) -> None:
+        self.rig, self.session, self.bus, self.host, self.cable = rig, session, bus, host, cable
         self.core = session.core
         self.waiting = list(session.plan.provocations)
         self.due: list[tuple[int, int, Provocation]] = []
@@ -295,7 +313,7 @@ class Conductor:
             degrees = math.degrees(core.loop._demand.master_position) % 360.0  # type: ignore[union-attr]
             if RETURN_STROKE_DEG[0] < degrees < RETURN_STROKE_DEG[1]:
                 self._arm(Moment.RETURN_STROKE)
-        law, demand = core.operation._demand.law, core.loop._demand  # type: ignore[union-attr]
+        law, demand = core._operation._demand.law, core.loop._demand  # type: ignore[union-attr]
         if not law.is_plain and demand is not None and Phase.RAMP_UP <= phase <= Phase.QUICK_STOP:
             session.is_law_plain = False
             # The law counts whole turns as the demand does.
@@ -334,6 +352,8 @@ class Conductor:
             self.host.away_until_ns = now_ns + round(provocation.value * SECOND)
         elif what is Mischief.HOST_LATE:
             self.host.late_until_ns = now_ns + round(provocation.value * SECOND)
+        elif what is Mischief.CONTROLLER_OFF:
+            self.cable.lose(now_ns, round(provocation.value * SECOND))
         else:
             self.session.killed_ns = now_ns
         self.bus.refresh()

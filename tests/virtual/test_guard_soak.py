@@ -70,7 +70,14 @@ def test_a_seed_is_one_campaign_and_its_sessions_meet_every_fault_at_every_momen
         kinds = {what for what, at in met if at is moment and isinstance(what, FaultKind)}
         missing = set(FaultKind) - kinds
         assert missing == ({FaultKind.JUMPING_RESOLVER} if moment is Moment.COMMISSIONING else early)
-    for what in (Mischief.KILLED, Mischief.HOST_AWAY, Mischief.HOST_LATE, Mischief.STOP, Mischief.QUICK_STOP):
+    for what in (
+        Mischief.KILLED,
+        Mischief.HOST_AWAY,
+        Mischief.HOST_LATE,
+        Mischief.CONTROLLER_OFF,
+        Mischief.STOP,
+        Mischief.QUICK_STOP,
+    ):
         assert {moment for told, moment in met if told is what} >= {*IN_MOTION, *IN_A_STOP}
 
 
