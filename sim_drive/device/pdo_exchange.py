@@ -10,7 +10,8 @@ from sim_drive.communication.cob_ids import COB_ID_MASK, EXTENDED_FRAME, is_rest
 from sim_drive.communication.dictionary import LiveDictionary
 from sim_drive.communication.emcy import EmergencyCode, EmergencyProducer, ErrorRegister
 from sim_drive.device.axis import Axis, SetPointSource
-from sim_drive.device.pdo_slave import ReceivePdo, TransmitPdo
+from sim_drive.device.receive_pdo import ReceivePdo
+from sim_drive.device.transmit_pdo import TransmitPdo
 from sim_drive.logical_axes import PDO_STEP, in_first_axis, of_axis
 
 PDO_COUNT: Final = 4
