@@ -19,7 +19,8 @@ from sim_drive.communication.parameter_file import make_parameter_store
 from sim_drive.device.drive import Drive
 from sim_drive.device.energy_meter import attach_energy_meter
 from sim_drive.logical_axes import MAX_AXES, eds_of_axes
-from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.machine import EmulatedMachine
+from sim_drive.machine_axis import MachineAxis
 from sim_drive.node_row import describe_row
 from sim_drive.physics.compliant import CompliantPlant
 from sim_drive.physics.coupling import Coupling

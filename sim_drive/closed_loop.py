@@ -22,7 +22,8 @@ from config.schema import GatewayConfig
 from mechanism.errors import ParameterError
 from mechanism.jit import kernel
 from sim_drive.assembly import build_machine
-from sim_drive.machine import TWO_SERVO_PERIODS_NS, MachineAxis
+from sim_drive.machine import TWO_SERVO_PERIODS_NS
+from sim_drive.machine_axis import MachineAxis
 from sim_drive.physics.driveline import SERVO_PERIOD_S
 from sim_drive.physics.five_bar_motion import advance_five_bar
 from sim_drive.physics.plant import CoupledPlant

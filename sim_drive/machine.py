@@ -7,68 +7,24 @@ the ticks never drift against the bus, and stand at the same nanoseconds in ever
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import floor, isfinite, pi, sin
 from random import Random
 from typing import Final, NamedTuple
 
 from drivers.frame import Frame
 from drivers.node import Event
-from sim_drive.machine_seam import AxisTap, DriveAxis, DriveTap, FrameHandler, Latch, MachineDrive
-from sim_drive.physics.driveline import SERVO_PERIOD_S
+from sim_drive.machine_axis import MachineAxis, Motor
+from sim_drive.machine_seam import DriveTap, FrameHandler, MachineDrive
 from sim_drive.physics.plant import Plant
-from sim_drive.physics.servo import SERVO_RATE_HZ, DemandResolution, ServoLoop
+from sim_drive.physics.servo import SERVO_RATE_HZ, ServoLoop
 
 TWO_SERVO_PERIODS_NS: Final = 2_000_000_000 // SERVO_RATE_HZ
 """A servo period is not a whole number of nanoseconds, but two are: 1953125 ns."""
 MAX_CATCH_UP_NS: Final = 1_000_000_000
 """A host that comes later than this has lost the time in between: see `TimeSkipped`."""
-LINKAGE_TORN_ERROR_CODE: Final = 0xFF10
-"""EMCY error code of a drive whose linkage has torn: of the device-specific range FF00h to FFFFh (CiA 301, 7.2.7.1)."""
-LINKAGE_TORN_REGISTER_BITS: Final = 0x81
-"""Generic and manufacturer-specific error (CiA 301, object error register)."""
 
 _NEVER: Final = 1 << 63
 _MAX_WAKES_PER_INSTANT: Final = 16
 _MAX_CROSS_ROUNDS: Final = 8
-
-
-@dataclass(frozen=True, slots=True)
-class MachineAxis:
-    """Resolver and scaling of one axis.
-
-    ``torque_per_volt`` in N m / V is the amplifier's; ``rated_torque_Nm`` is what 1000 per mille are;
-    ``resolver_noise_counts`` the standard deviation of the resolver's noise before it is quantised, 0 for none;
-    ``output_delay_periods``: 1 where the controller's output acts one servo period after the position it was made from,
-    as in a drive that computes in between, 0 where it acts at once; ``resolver_eccentricity_counts``: amplitude of an
-    error once a revolution, of a rotor that does not run true, which passes zero rising at
-    ``resolver_eccentricity_rad``.
-
-    Raises ValueError where a value is out of its bounds.
-    """
-
-    counts_per_revolution: int = 4096
-    torque_per_volt: float = 0.45
-    rated_torque_Nm: float = 1.0
-    resolver_noise_counts: float = 0.0
-    demand_resolution: DemandResolution = DemandResolution.UNROUNDED_DIFFERENCE
-    output_delay_periods: int = 0
-    resolver_eccentricity_counts: float = 0.0
-    resolver_eccentricity_rad: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.counts_per_revolution < 1:
-            raise ValueError(f"counts_per_revolution = {self.counts_per_revolution!r}, must be 1 or more")
-        for name, value in (("torque_per_volt", self.torque_per_volt), ("rated_torque_Nm", self.rated_torque_Nm)):
-            if not (isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} = {value!r}, must be finite and positive")
-        for name, value in (
-            ("resolver_noise_counts", self.resolver_noise_counts),
-            ("resolver_eccentricity_counts", self.resolver_eccentricity_counts),
-        ):
-            if not (isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} = {value!r}, must be finite and zero or more")
-        if self.output_delay_periods not in (0, 1):
-            raise ValueError(f"output_delay_periods = {self.output_delay_periods!r}, must be 0 or 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,54 +55,6 @@ class TickRecord(NamedTuple):
     """Energy that the axis has drawn from its supply, see `AxisEnergy`."""
 
 
-class _Motor:
-    """One axis of the machine: of a drive and of the plant, with scaling and servo loop, and the resolver's last."""
-
-    __slots__ = (
-        "axis",
-        "counts",
-        "counts_per_rad",
-        "delayed_torque",
-        "drive_axis",
-        "eccentricity",
-        "index",
-        "is_plain",
-        "is_powered",
-        "noise",
-        "permille_per_Nm",
-        "servo",
-        "tap",
-        "velocity",
-    )
-
-    def __init__(self, index: int, drive_axis: DriveAxis, axis: MachineAxis) -> None:
-        self.index = index
-        self.drive_axis = drive_axis
-        self.axis = axis
-        self.servo = ServoLoop(axis.demand_resolution)
-        self.counts_per_rad = axis.counts_per_revolution / (2.0 * pi)
-        self.permille_per_Nm = 1000.0 / axis.rated_torque_Nm
-        self.noise = 0.0
-        self.eccentricity = axis.resolver_eccentricity_counts
-        self.counts = 0
-        self.velocity = 0.0
-        """Counts/s, over the last servo period."""
-        self.is_powered = False
-        self.delayed_torque = 0.0
-        """Torque command of the last servo tick, with an output delay."""
-        self.tap: AxisTap | None = None
-        self.is_plain = not self.eccentricity
-        """Whether the resolver shows no more than the angle and its noise."""
-
-    def quantise(self, angle_rad: float) -> int:
-        """What the resolver shows at this angle."""
-        reading = angle_rad * self.counts_per_rad + self.noise + 0.5
-        if self.eccentricity:
-            reading += self.eccentricity * sin(angle_rad - self.axis.resolver_eccentricity_rad)
-        counts = floor(reading)
-        return counts if self.tap is None else self.tap.show(counts)
-
-
 class _Station:
     """One drive on the bus, and the motors that it has."""
 
@@ -163,7 +71,7 @@ class _Station:
         "wake_ns",
     )
 
-    def __init__(self, drive: MachineDrive, motors: Sequence[_Motor]) -> None:
+    def __init__(self, drive: MachineDrive, motors: Sequence[Motor]) -> None:
         self.drive = drive
         self.motors = tuple(motors)
         self.tap: DriveTap | None = None
@@ -193,8 +101,7 @@ class EmulatedMachine:
 
     At a servo tick the plant is first advanced to it under the torques commanded at the tick before. Then each axis of
     each drive in turn is shown its resolver and asked for its demand, from which its servo loop makes the torque for
-    the coming period. An axis that is not powered gets no torque, and its servo loop starts anew, without a jump, when
-    it is.
+    the coming period (`sim_drive.machine_axis.Motor`).
 
     Frames are dispatched by COB-ID. What one drive sends, the other drives of the machine hear too, as on a wire, but
     at once rather than after its time on the wire: after all drives have taken the frame or tick that caused it, so
@@ -214,7 +121,6 @@ class EmulatedMachine:
         "_has_tripped",
         "_motors",
         "_next_tick_ns",
-        "_noise_source",
         "_routes",
         "_start_ns",
         "_stations",
@@ -253,12 +159,13 @@ class EmulatedMachine:
         self.axes: Final = tuple(axes)
         self.records: Final = deque[TickRecord](maxlen=record_ticks)
         self.drive_axes: Final = tuple(axis for drive in self.drives for axis in drive.axes)
+        noise_source = Random(seed)  # noqa: S311 - reproducible on purpose
         self._motors: Final = tuple(
-            _Motor(index, *pair) for index, pair in enumerate(zip(self.drive_axes, axes, strict=True))
+            Motor(index, drive_axis, axis, plant, noise_source, start_ns)
+            for index, (drive_axis, axis) in enumerate(zip(self.drive_axes, axes, strict=True))
         )
         motors = iter(self._motors)
         self._stations: Final = tuple(_Station(drive, [next(motors) for _ in drive.axes]) for drive in self.drives)
-        self._noise_source = Random(seed)  # noqa: S311 - reproducible on purpose
         self._torques = [0.0] * count
         self._brakes = [True] * count
         self._has_tripped = False
@@ -273,9 +180,6 @@ class EmulatedMachine:
         self._frames: list[Frame] = []
         self._events: list[Event] = []
         self._routes: dict[int, _Route] = {}
-        for motor in self._motors:
-            motor.counts = motor.quantise(plant.angle(motor.index))
-            motor.drive_axis.measure_by(self._latch_of(motor))
         for station in self._stations:
             self._ask_wake(station)
         self._read_subscriptions()
@@ -295,8 +199,7 @@ class EmulatedMachine:
         station.tap = tap
         station.receive = station.receive_through_tap
         for motor, axis_tap in zip(station.motors, tap.axes, strict=True):
-            motor.tap = axis_tap
-            motor.is_plain = False
+            motor.put_tap(axis_tap)
         self._read_subscriptions()
 
     def deliver(self, place: int, frame: Frame, now_ns: int) -> None:
@@ -415,9 +318,12 @@ class EmulatedMachine:
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
         is_quiet = True
+        angle = plant.angle
         for station in self._stations:
             for motor in station.motors:
-                self._run_servo(motor, now_ns)
+                index = motor.index
+                self._torques[index] = motor.run(now_ns, angle(index))
+                self._brakes[index] = motor.is_braked
             station.after_servo_tick(now_ns)
             drive = station.drive
             if drive.is_wake_stale:
@@ -428,55 +334,6 @@ class EmulatedMachine:
             self._record(now_ns)
         if not is_quiet:
             self._exchange(now_ns)
-
-    def _run_servo(self, motor: _Motor, now_ns: int) -> None:
-        """Show an axis its resolver, and let its controller make the torque for the coming servo period."""
-        index = motor.index
-        drive_axis = motor.drive_axis
-        axis = motor.axis
-        if axis.resolver_noise_counts > 0.0:
-            motor.noise = self._noise_source.gauss(0.0, axis.resolver_noise_counts)
-        angle = self.plant.angle(index)
-        tap = motor.tap
-        plain = angle * motor.counts_per_rad + motor.noise + 0.5
-        counts = floor(plain) if motor.is_plain else motor.quantise(angle)
-        motor.velocity = float((counts - motor.counts) * SERVO_RATE_HZ)
-        motor.counts = counts
-        drive_axis.on_tick(now_ns, counts)
-        self._brakes[index] = not drive_axis.is_brake_released and (tap is None or not tap.is_brake_broken)
-        if not drive_axis.is_powered:
-            motor.is_powered = False
-            self._torques[index] = motor.delayed_torque = 0.0
-            return
-        demand = drive_axis.position_demand_counts
-        if not motor.is_powered:
-            self._power_on(motor, demand, now_ns)
-        torque = None if drive_axis.torque_demand is None else drive_axis.torque_demand_Nm
-        if torque is None:
-            torque = motor.servo.update(
-                demand,
-                counts,
-                drive_axis.gains,
-                drive_axis.torque_offset_Nm,
-                axis.torque_per_volt,
-                drive_axis.torque_limit_Nm,
-                drive_axis.negative_torque_limit_Nm,
-                drive_axis.velocity_offset,
-            )
-        else:
-            # The controller is to start without a bump when it gets the axis back.
-            motor.servo.reset(demand, counts)
-        if axis.output_delay_periods:
-            torque, motor.delayed_torque = motor.delayed_torque, torque
-        self._torques[index] = torque
-
-    def _power_on(self, motor: _Motor, demand_counts: float, now_ns: int) -> None:
-        """The drive has switched its amplifier on since the tick before."""
-        motor.is_powered = True
-        motor.servo.reset(demand_counts, motor.counts)
-        if self._has_tripped:
-            # Neither a fault reset nor switching the drive off and on mends a torn linkage.
-            motor.drive_axis.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
 
     def _exchange(self, now_ns: int) -> None:
         """Collect what the drives have sent and noticed, and let them hear each other."""
@@ -517,34 +374,12 @@ class EmulatedMachine:
                 routes[cob_id] = (*routes.get(cob_id, ()), (station, handler))
         self._routes = routes
 
-    def _latch_of(self, motor: _Motor) -> Latch:
-        index = motor.index
-        angle = self.plant.angle
-        torque = self.plant.torque
-
-        def latch(now_ns: int) -> tuple[int, float, int]:
-            offset_s = (now_ns - self._tick_ns) * 1e-9
-            if offset_s < 0.0:
-                offset_s = 0.0
-            elif offset_s > SERVO_PERIOD_S:
-                offset_s = SERVO_PERIOD_S
-            radians = angle(index, offset_s)
-            return (
-                floor(radians * motor.counts_per_rad + motor.noise + 0.5)
-                if motor.is_plain
-                else motor.quantise(radians),
-                motor.velocity,
-                floor(torque(index) * motor.permille_per_Nm + 0.5),
-            )
-
-        return latch
-
     def _trip_all(self, torn_at_s: float, now_ns: int) -> None:
         self._has_tripped = True
         angles = tuple(self.plant.angle(motor.index) for motor in self._motors)
         self._events.append(LinkageTorn(now_ns, torn_at_s, angles))
         for motor in self._motors:
-            motor.drive_axis.trip(LINKAGE_TORN_ERROR_CODE, LINKAGE_TORN_REGISTER_BITS, now_ns, persists=True)
+            motor.trip(now_ns)
 
     def _skip_to(self, now_ns: int) -> None:
         """Let the last servo tick not after ``now_ns`` be the next one."""

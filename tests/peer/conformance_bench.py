@@ -16,7 +16,8 @@ from mechanism.cam_image import decode_cam_image
 from sim_drive.assembly import FREE_AXIS, FREE_AXIS_GAINS, SHIPPED_EDS
 from sim_drive.device.drive import Drive
 from sim_drive.logical_axes import eds_of_axes
-from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.machine import EmulatedMachine
+from sim_drive.machine_axis import MachineAxis
 from sim_drive.physics.free_axis import FreeAxisPlant
 from sim_drive.settings import DriveSettings
 

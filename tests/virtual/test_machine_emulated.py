@@ -10,15 +10,9 @@ from drivers.frame import Frame
 from drivers.node import Event
 from mechanism.dynamics import STANDARD_GRAVITY, DynamicsParameters, LinkParameters
 from mechanism.five_bar import Closure, FiveBar
-from sim_drive.machine import (
-    LINKAGE_TORN_ERROR_CODE,
-    EmulatedMachine,
-    Latch,
-    LinkageTorn,
-    MachineAxis,
-    TickRecord,
-    TimeSkipped,
-)
+from sim_drive.machine import EmulatedMachine, LinkageTorn, TickRecord, TimeSkipped
+from sim_drive.machine_axis import LINKAGE_TORN_ERROR_CODE, MachineAxis
+from sim_drive.machine_seam import Latch
 from sim_drive.physics.driveline import AxisDriveline
 from sim_drive.physics.free_axis import FreeAxisParameters, FreeAxisPlant
 from sim_drive.physics.plant import CoupledPlant, PlantParameters

@@ -6,7 +6,8 @@ from test_machine_emulated import COUNTS_PER_RAD, MS, Bench
 
 from drivers.frame import Frame
 from sim_drive.assembly import free_machine
-from sim_drive.machine import EmulatedMachine, MachineAxis
+from sim_drive.machine import EmulatedMachine
+from sim_drive.machine_axis import MachineAxis
 from sim_drive.physics.free_axis import FreeAxisParameters
 
 
