@@ -29,7 +29,7 @@ class Late:
     sent_ns: int | None
     """When the demand was on the bus; None while it is not known."""
     is_paced: bool
-    """SYNC is sent by somebody else, and seen: that it is not where it should be is not the loop's doing."""
+    """SYNC is sent by somebody else, at instants that are not the loop's doing."""
     deviation_ns: int
     """SYNC(k) against its ideal instant."""
     tpdo_ns: int | None
@@ -40,6 +40,8 @@ class Late:
 class Spell:
     """One spell of the loop being awake, and the sleep before it; spans in ns."""
 
+    has_rested: bool
+    """There was a sleep before it; else it is the later part of a spell that did not end."""
     planned_ns: int
     """When it was to wake."""
     woke_ns: int
@@ -181,7 +183,7 @@ def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -
         # All that is certain without the kernel's counters: asleep it did not work.
         off_ns = min(off_ns, late_wake_ns)
     # Later in its cycle than the phase, because SYNC was early, or because TPDOs were waited for.
-    waited_ns = max(0, spell.planned_ns - late.sync_ns - phase_ns)
+    waited_ns = max(0, spell.planned_ns - late.sync_ns - phase_ns) if spell.has_rested else 0
     early_ns = min(waited_ns, before_ns)
     drives_ns = waited_ns - early_ns
     if late.tpdo_ns is not None:

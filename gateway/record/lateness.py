@@ -218,7 +218,7 @@ class LateRecord:
 
     account: LateAccount
     worst: tuple[LateDemand, ...]
-    """Of those that were told one by one, the latest first."""
+    """Of those that were told one by one; first those that are not explained, then the latest."""
 
     def to_json(self, missed: int) -> dict[str, Any]:
         """Stable keys; ``missed``: how many the samples count, so that none can be left out of the account."""
@@ -264,7 +264,7 @@ def late_record(events: Iterable[Mapping[str, Any]], most: int = MOST_SHOWN) -> 
             demands.append(_late_demand(data))
     if account is None:
         return None
-    demands.sort(key=lambda demand: (-demand.missed_by_us, demand.cycle))
+    demands.sort(key=lambda demand: (demand.is_explained, -demand.missed_by_us, demand.cycle))
     return LateRecord(account, tuple(demands[:most]))
 
 

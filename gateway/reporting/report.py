@@ -206,7 +206,7 @@ def _late_table(recording: Recording, report: RunReport) -> str:
         )
         for demand in late.worst
     )
-    title = f"<summary>The {len(late.worst)} latest demands and SYNCs that were told one by one</summary>"
+    title = f"<summary>The worst {len(late.worst)}, first those that are not explained</summary>"
     table = f'<div class="scroll"><table><thead>{head}</thead><tbody>{body}</tbody></table></div>'
     return f'<details id="late">{title}{table}</details>'
 

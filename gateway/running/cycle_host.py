@@ -76,6 +76,10 @@ class LateWatch(LateListener, Protocol):
         """It has waited for frames, and goes on at this time."""
         ...
 
+    def sync_is_stale(self) -> None:
+        """The SYNC that the loop is given next was on the bus before the instant that it is told."""
+        ...
+
     def was_refused(self, span_ns: int) -> None:
         """It has waited so long for a bus that was full."""
         ...
@@ -168,6 +172,8 @@ class CycleHost:
             frame, arrival_ns = received
             if arrival_ns > self._latest_ns:
                 self._latest_ns = arrival_ns
+            elif self._late is not None and frame.cob_id == SYNC_COB_ID and arrival_ns < self._latest_ns:
+                self._late.sync_is_stale()
             if frame.cob_id == self._echo_cob_id:
                 core.loop.sent(self._latest_ns)
                 continue

@@ -209,7 +209,7 @@ def late_accountant(config: GatewayConfig, bus: CycleBus, ring: RingWriter) -> L
     period_ns = config.bus.cycle_us * 1000
 
     def tell(at_ns: int, kind: str, text: str, data: dict[str, str | int | bool]) -> None:
-        ring.append_event(at_ns, kind, text, source="gateway", **data)
+        ring.append_event(at_ns, kind, text, **data)
 
     def trace(text: str, figures: dict[str, int]) -> None:
         ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)

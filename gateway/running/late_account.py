@@ -9,6 +9,7 @@ import os
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, Protocol
 
@@ -27,6 +28,8 @@ from gateway.running.wake_trace import WakeTrace
 
 LONG_SHARE: Final = 0.25
 """A spell of so large a part of the cycle is looked at."""
+LONGEST_SPELL: Final = 4
+"""After so many cycles without rest a spell is closed, lest what happened in its beginning explain all that follows."""
 NO_REST_NS: Final = 15_000
 """A wait that ends within this did not wait."""
 COARSE_NS: Final = 50_000
@@ -37,6 +40,8 @@ MAX_TOLD: Final = 1000
 """Late demands told one by one in a run."""
 MAX_PENDING: Final = 64
 _MAX_QUEUED: Final = 64
+_NO_REST: Final = -1
+"""In place of the number of waits for the bus: the spell began without a wake, which would have been a switch too."""
 _STAT_BYTES: Final = 96
 
 Tell = Callable[[int, str, str, dict[str, str | int | bool]], None]
@@ -154,6 +159,8 @@ class LateAccountant:
         self._looked: Spell | None = None
         """The long spell that ended last, in cycle ``_looked_cycle``."""
         self._looked_cycle = self._closed_cycle = -1
+        self._stale_cycle = -2
+        """The SYNC after this one was given an instant that is not the kernel's."""
         self._handed_ns = 0
         """When the loop rested after the demand of cycle ``_closed_cycle``."""
         self._pending: list[_Pending] = []
@@ -219,6 +226,10 @@ class LateAccountant:
             # Called by a frame: the time for which it was ready then is all that it can have come too late.
             self._planned_ns = woke_ns - self._ready_at_wake_ns
 
+    def sync_is_stale(self) -> None:
+        """See ``gateway.running.cycle_host.LateWatch``."""
+        self._stale_cycle = -1 if self._loop is None else self._loop.cycle
+
     def was_refused(self, span_ns: int) -> None:
         """See ``gateway.running.cycle_host.LateWatch``."""
         self._bus_ns += span_ns
@@ -233,12 +244,14 @@ class LateAccountant:
             self._count(Explanation(late.kind, late.cycle, late.deadline_ns, by_ns, ((Cause.SYNC_IRREGULAR, by_ns),)))
             return
         if len(self._pending) >= MAX_PENDING:
-            self._settle(self._clock(), None)
+            self._look(self._clock(), -1)
         is_earlier = late.is_paced and late.sent_ns is not None and self._closed_cycle == late.cycle
         looked = self._looked if self._looked_cycle == late.cycle else None
         # A loop that sends SYNC itself may have been late with that one already.
         carried = () if late.is_paced or looked is None else self._why_sync_was_late(late, looked)
         sent_ns = None if self._is_echoed and late.is_paced else late.sent_ns
+        if self._stale_cycle >= late.cycle - 1:
+            late = replace(late, is_paced=False)
         if is_earlier:
             self._pending.append(_Pending(late, sent_ns, looked, carried, self._handed_ns))
         else:
@@ -255,9 +268,12 @@ class LateAccountant:
 
     def tell(self) -> None:
         """Tell at most one event, if it is time for one; called where the loop has nothing more urgent to do."""
-        if not self._is_news and self._trace is None:
+        if not self._is_news and self._trace is None and not self._pending:
             return
         now_ns = self._clock()
+        if self._pending and now_ns - self._planned_ns > LONGEST_SPELL * self._period_ns:
+            self._look(now_ns, -1)
+            self._begin_anew(now_ns)
         if self._is_news and now_ns - self._told_ns >= TELL_EVERY_NS:
             self._tell_account(now_ns)
         elif self._queue and now_ns - self._demand_told_ns >= TELL_DEMAND_EVERY_NS:
@@ -277,6 +293,16 @@ class LateAccountant:
         if self._trace is not None:
             self._trace.flush()
 
+    def _begin_anew(self, now_ns: int) -> None:
+        """A spell begins without a rest before it."""
+        self._rest_ns = self._planned_ns = self._woke_ns = now_ns
+        self._stale_ns = self._ready_at_wake_ns = self._bus_ns = 0
+        self._refusals = _NO_REST
+        if self._counters is not None:
+            self._counters_before = self._counters()
+        if self._is_fine:
+            self._processor_before_ns = self._processor_ns()
+
     def _ready_so_far_ns(self) -> int:
         """Ready without a processor since the last rest began."""
         if self._counters is None:
@@ -295,6 +321,7 @@ class LateAccountant:
         faults = self._faults()
         stood_still_ns = 0 if self._witness is None else self._witness.stood_still_ns(self._planned_ns, now_ns)
         spell = Spell(
+            has_rested=self._refusals >= 0,
             planned_ns=self._planned_ns,
             woke_ns=self._woke_ns,
             end_ns=now_ns,
