@@ -25,7 +25,7 @@ from gateway.record.lateness import LATE_ACCOUNT_KIND, LATE_KINDS, LateAccount
 from gateway.record.ring import RingReader, RunState, attach
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import Phase, SampleArray
-from gateway.reporting.report_text import number
+from gateway.reporting.number_text import number, row_of_numbers
 
 REFRESH_S: Final = 0.1
 JSON_INTERVAL_S: Final = 1.0
@@ -231,10 +231,6 @@ def sparkline(values: tuple[float | None, ...]) -> str:
     return "".join(" " if v is None else _SPARK_LEVELS[round((v - low) / span * top)] for v in values)
 
 
-def _figures(*values: float | None) -> str:
-    return " / ".join(number(value, 1) for value in values) + " µs"
-
-
 def _bar(share: float, width: int = 16) -> Text:
     """A bar from the middle, to the right for positive torque; full at the rated torque."""
     half = width // 2
@@ -242,6 +238,33 @@ def _bar(share: float, width: int = 16) -> Text:
     empty = " " * (half - filled)
     text = f"{' ' * half}│{'█' * filled}{empty}" if share >= 0 else f"{empty}{'█' * filled}│{' ' * half}"
     return Text(text, style="red" if abs(share) > 1.0 else "cyan")
+
+
+def _timing(view: MonitorView) -> list[RenderableType]:
+    """Every spread of ``Timing`` and every count of ``CycleCounts``, and why deadlines were missed."""
+    grid = Table.grid(padding=(0, 2))
+    spreads, counts, late = view.spreads, view.counts, view.late
+    period, arrival = spreads[Timing.SYNC_PERIOD], spreads[Timing.TPDO_ARRIVAL]
+    lead, loop = spreads[Timing.RPDO_LEAD], spreads[Timing.LOOP_TIME]
+    for what, figures, which in (
+        ("|SYNC period − cycle|", view.sync_period_deviation_us, "p50 / p99 / max, last turn"),
+        ("wake-up lateness", view.wake_lateness_us, "p50 / p99 / max, last turn"),
+        ("SYNC period", (period.min, period.p50, period.max), "least / p50 / max, so far"),
+        ("last TPDO after SYNC", (arrival.p50, arrival.p99, arrival.max), "p50 / p99 / max, so far"),
+        ("last RPDO before SYNC", (lead.min, lead.p1, lead.p50), "least / p1 / p50, so far"),
+        ("processor time a cycle", (loop.p50, loop.p99, loop.max), "p50 / p99 / max, so far"),
+    ):
+        grid.add_row(what, row_of_numbers(*figures), which)
+    missed = (
+        f"{counts.missed_tpdo} TPDO ({counts.late_tpdo} came late), {counts.missed_rpdo_deadline} deadline, "
+        f"{counts.overruns} overrun, {counts.sync_lost} SYNC, {counts.bus_errors} bus error, "
+        f"{counts.send_buffer_full} buffer full"
+    )
+    parts: list[RenderableType] = [grid, Text(f"missed so far: {missed}", style="bold red" if counts.total else "")]
+    if late is not None:
+        style = "bold red" if late.not_explained else ""
+        parts.append(Text(f"deadlines of the run, why missed: {late.verdict()}", style=style))
+    return parts
 
 
 def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
@@ -280,30 +303,6 @@ def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
         known = [value for value in axis.errors_over_cycle if value is not None]
         scale = f"{number(min(known), sign=True)} … {number(max(known), sign=True)} counts" if known else ""
         sparks.add_row(Text(axis.name, style="bold"), Text(sparkline(axis.errors_over_cycle), style="cyan"), scale)
-    timing = Table.grid(padding=(0, 2))
-    for what, figures in (
-        ("|SYNC period − cycle|", view.sync_period_deviation_us),
-        ("wake-up lateness", view.wake_lateness_us),
-    ):
-        timing.add_row(what, " / ".join(number(value, 1) for value in figures) + " µs", "p50 / p99 / max")
-    arrival, lead = view.spreads[Timing.TPDO_ARRIVAL], view.spreads[Timing.RPDO_LEAD]
-    timing.add_row("last TPDO after SYNC", _figures(arrival.p50, arrival.p99, arrival.max), "p50 / p99 / max, so far")
-    timing.add_row("last RPDO before SYNC", _figures(lead.min, lead.p1, lead.p50), "least / p1 / p50, so far")
-    counts = view.counts
-    timing.add_row(
-        "missed, as far as seen",
-        Text(
-            f"{counts.missed_tpdo} TPDO, {counts.missed_rpdo_deadline} deadline, {counts.overruns} overrun, "
-            f"{counts.sync_lost} SYNC, {counts.bus_errors} bus error, {counts.send_buffer_full} buffer full",
-            style="bold red" if counts.total else "",
-        ),
-        f"loop {number(view.loop_cpu_us, 1)} µs a cycle",
-    )
-    if view.late is not None:
-        late = view.late
-        timing.add_row(
-            "deadlines, why missed", Text(late.verdict(), style="bold red" if late.not_explained else ""), "of the run"
-        )
     parts: list[RenderableType] = [
         head,
         axes,
@@ -311,7 +310,7 @@ def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
         sparks,
         Text(),
     ]
-    parts.append(timing)
+    parts.extend(_timing(view))
     if view.events:
         parts.extend((Text(), *(Text(line, style="dim", overflow="ellipsis", no_wrap=True) for line in view.events)))
     return Group(*parts)

@@ -8,8 +8,8 @@ from rich import box
 from rich.table import Table
 
 from gateway.reporting import paper_reference as paper
+from gateway.reporting.number_text import number
 from gateway.reporting.paper_figures import Reproduction
-from gateway.reporting.report_text import number
 
 ERROR_BOUND_COUNTS: Final = 10.0
 CV_ERROR_BOUND_COUNTS: Final = 4.0

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
+from gateway.record.sample import MISSED_TPDO_MASK
 from gateway.reporting.analysis import BoolArray, FloatArray, RunData
 from gateway.reporting.cycle_errors import cycle_errors
 from gateway.reporting.figure import (
@@ -243,16 +244,20 @@ def _torque(data: RunData, theme: Theme) -> Figure:
 
 def _timing(data: RunData, theme: Theme) -> Figure:
     samples = data.samples
-    figure = new_figure(8.6, 3.0)
+    figure = new_figure(8.6, 5.2)
     period_ns = data.constants.period_s * 1e9
-    has_period = samples["sync_period_ns"] > 0
-    panels = figure.subplots(1, 3, sharey=True)
+    has_period, loop_ns = samples["sync_period_ns"] > 0, samples["loop_cpu_ns"]
+    has_tpdos = (samples["flags"] & MISSED_TPDO_MASK) == 0
+    panels = figure.subplots(2, 3, sharey=True).ravel()
     quantities = (
         ("SYNC period − cycle (µs)", (samples["sync_period_ns"][has_period] - period_ns) / 1e3),
         ("wake-up lateness (µs)", samples["wake_lateness_ns"] / 1e3),
         ("last RPDO before next SYNC (µs)", samples["rpdo_lead_ns"] / 1e3),
+        ("last TPDO after SYNC (µs)", samples["tpdo_arrival_ns"][has_tpdos] / 1e3),
+        ("processor time of the loop (µs)", loop_ns[loop_ns > 0] / 1e3),
     )
-    for axes, (label, values) in zip(panels, quantities, strict=True):
+    panels[-1].set_axis_off()
+    for axes, (label, values) in zip(panels, quantities, strict=False):
         _histogram(axes, values, theme.path)
         axes.set_xlabel(label)
     panels[2].axvline(0, color=theme.bad, lw=1.2, ls=(0, (4, 2)))
@@ -266,7 +271,8 @@ def _timing(data: RunData, theme: Theme) -> Figure:
         color=theme.bad,
         fontsize=8.5,
     )
-    panels[0].set_ylabel("cycles")
+    for axes in panels[::3]:
+        axes.set_ylabel("cycles")
     return figure
 
 

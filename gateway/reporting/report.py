@@ -9,6 +9,7 @@ from gateway.record.lateness import IN_WORDS, LATE_KINDS, LateKind, late_record
 from gateway.record.recording import Recording, RecordingError, read_recording
 from gateway.reporting import paper_reference as paper
 from gateway.reporting.analysis import RunData, RunReport, cam_of, prepare, report_of
+from gateway.reporting.number_text import number
 from gateway.reporting.plots import Plot, plots_of, to_png, to_svg
 from gateway.reporting.report_page import PAGE, STYLE
 from gateway.reporting.report_text import (
@@ -18,7 +19,6 @@ from gateway.reporting.report_text import (
     is_bad,
     is_verdict_bad,
     late_row,
-    number,
     point,
 )
 

@@ -8,11 +8,11 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from gateway.record.histograms import Timing
+from gateway.record.histograms import Spread, Timing
 from gateway.reporting import paper_reference as paper
 from gateway.reporting.analysis import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
+from gateway.reporting.number_text import NOTHING, number, row_of_numbers
 
-NOTHING = "–"
 _COUNTED_FAULTS = frozenset(
     {
         "TPDOs missed",
@@ -34,14 +34,6 @@ class Row:
     unit: str
     ours: tuple[str, ...]
     paper: tuple[str, ...]
-
-
-def number(value: float | None, decimals: int = 0, *, sign: bool = False) -> str:
-    """A figure as text; a dash for None."""
-    if value is None:
-        return NOTHING
-    text = f"{value:+,.{decimals}f}" if sign else f"{value:,.{decimals}f}"
-    return text.replace("-", "−").replace(",", " ")
 
 
 def axis_rows(figures: PhaseFigures, *, master: int, slave: int, is_reference: bool) -> list[Row]:
@@ -128,12 +120,13 @@ def axis_rows(figures: PhaseFigures, *, master: int, slave: int, is_reference: b
 def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
     """The timing of the cycle as (what, figure)."""
 
-    def spread(figures: Distribution) -> str:
-        return " / ".join(number(value, 1) for value in (figures.p50, figures.p99, figures.max))
+    def spread(figures: Distribution | Spread) -> str:
+        return row_of_numbers(figures.p50, figures.p99, figures.max)
 
     counts = cycle.counts
-    lead, leads = cycle.rpdo_lead_us, cycle.histograms.spread(Timing.RPDO_LEAD)
-    times = cycle.histograms.spread(Timing.LOOP_TIME)
+    periods, leads, times = (
+        cycle.histograms.spread(timing) for timing in (Timing.SYNC_PERIOD, Timing.RPDO_LEAD, Timing.LOOP_TIME)
+    )
     return [
         ("cycles recorded", f"{number(cycle.count)} of {cycle.period_s * 1e3:g} ms"),
         ("TPDOs missed", number(counts.missed_tpdo)),
@@ -144,17 +137,13 @@ def cycle_rows(cycle: CycleFigures) -> list[tuple[str, str]]:
         ("cycles with bus errors", number(counts.bus_errors)),
         ("cycles with a full send buffer", number(counts.send_buffer_full)),
         ("samples lost", number(cycle.lost_samples)),
-        ("|SYNC period − cycle|, p50 / p99 / max", f"{spread(cycle.sync_period_deviation_us)} µs"),
-        ("wake-up lateness, p50 / p99 / max", f"{spread(cycle.wake_lateness_us)} µs"),
-        ("last TPDO after SYNC, p50 / p99 / max", f"{spread(cycle.tpdo_arrival_us)} µs"),
-        (
-            "last RPDO before SYNC, least / p1 / p50",
-            f"{' / '.join(number(value, 1) for value in (lead.min, leads.p1, leads.p50))} µs",
-        ),
-        (
-            "processor time of the loop a cycle, mean / p99",
-            f"{number(cycle.loop_cpu_us_per_cycle, 1)} / {number(times.p99, 1)} µs",
-        ),
+        ("SYNC period, least / p50 / max", row_of_numbers(periods.min, periods.p50, periods.max)),
+        ("|SYNC period − cycle|, p50 / p99 / max", spread(cycle.sync_period_deviation_us)),
+        ("wake-up lateness, p50 / p99 / max", spread(cycle.wake_lateness_us)),
+        ("last TPDO after SYNC, p50 / p99 / max", spread(cycle.tpdo_arrival_us)),
+        ("last RPDO before SYNC, least / p1 / p50", row_of_numbers(cycle.rpdo_lead_us.min, leads.p1, leads.p50)),
+        ("processor time of the loop a cycle, mean", f"{number(cycle.loop_cpu_us_per_cycle, 1)} µs"),
+        ("processor time of the loop a cycle, p50 / p99 / max", spread(times)),
     ]
 
 

@@ -9,8 +9,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gateway.reporting.number_text import number
 from gateway.reporting.report_page import PAGE_HEAD, STYLE
-from gateway.reporting.report_text import number
 from gateway.synthesis.linkage_motion import LinkageMotion
 from gateway.synthesis.machine_files import MachineFiles, variables_mm
 from gateway.synthesis.report_plots import SynthesisData, synthesis_plots

@@ -9,7 +9,7 @@ from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 
 from gateway.record.sample import Phase, SampleArray, SampleFlag, missed_tpdo_flag
 from gateway.reporting.analysis import SMOOTHING_CYCLES, RunReport, prepare, report_of
-from gateway.reporting.report_text import number
+from gateway.reporting.number_text import number
 
 
 def report(samples: SampleArray) -> RunReport:
