@@ -92,7 +92,7 @@ class MotionSection(Model):
     approach_speed_rad_per_s: Positive = 0.5
     """Of the faster axis on the slow way onto the cam, from wherever the linkage stands."""
     engagement_window_deg: Annotated[float, Field(ge=1.0, le=360.0)] | None = None
-    """Of the master, within which the slave leaves its cam or is back on it; null: the narrowest that fits."""
+    """Of the master, within which the slave leaves its cam or is back on it; null: whichever fits best there."""
     cam_points: Annotated[int, Field(ge=64, le=65536)] = 1024
     structural_error_limit_mm: Annotated[float, Field(gt=0.0, le=1000.0)] = 0.5
 

@@ -251,7 +251,10 @@ class LawProof:
         self._take(Piece(LawState(), points=1), self._pace(Pace(0.0)), LawState().to_array(), 0, 1)
 
     def excess(self, pieces: Sequence[Piece], pace: Pace, margin: float = GRID_MARGIN) -> Work[Excess | None]:
-        """The limit that is passed most in any of the pieces at this pace or slower; None if all are kept."""
+        """The limit that is passed most in any of the pieces at this pace or slower; None if all are kept.
+
+        ``margin`` is the factor by which everything has to stay away from its limit.
+        """
         limits = self.limits
         if abs(pace.speed) > limits.master_velocity:
             limit = limits.master_velocity
@@ -318,7 +321,8 @@ class LawProof:
     def _judge(self, margin: float) -> Excess | None:
         limits = self.limits
         least, at = self._worst[Strained.SINE].tolist()
-        if not least >= limits.minimum_sine:
+        # The sine's own minimum lies between the angles by less than it matters: it is a distance, no end stop.
+        if not least >= limits.minimum_sine * max(margin / GRID_MARGIN, 1.0):
             return Excess(Strained.SINE, "", least if least == least else 0.0, limits.minimum_sine, at)
         worst: Excess | None = None
         share = 1.0

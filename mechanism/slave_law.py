@@ -5,6 +5,7 @@ the cam) or back within a window of theta2, so that it is the master's motion th
 between stays on a path that has been looked at.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, degrees, inf, radians, tau
 from typing import Final
@@ -12,6 +13,7 @@ from typing import Final
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import MotionError
 from mechanism.law_proof import (
+    GRID_MARGIN,
     PASS_POINTS,
     Excess,
     LawLimits,
@@ -30,7 +32,10 @@ FADE_RAD: Final = 0.1
 WINDOW_POINTS: Final = 2 * PASS_POINTS
 CAM_POINTS: Final = 64 * PASS_POINTS
 WINDOWS: Final = tuple(radians(window) for window in range(10, 361, 5))
-"""From which the shortest is taken that keeps all limits, where none is asked for."""
+"""Where none is asked for, the narrowest of these is taken that keeps away from all limits by ``EASE``, or else the
+narrowest that keeps them.
+"""
+EASE: Final = 1.5
 SHIFTS: Final = 5
 """Shifts, from the old to the new one, of which the path is looked at."""
 SLOWER: Final = (1.0, 2.0, 4.0, 8.0)
@@ -176,7 +181,7 @@ class SlaveLaw:
 
     def prove_engagement(self, is_engaged: bool, at: float, window: float, speed: float) -> "Work[Engagement]":
         """Prove that the slave leaves its cam, or returns, from the master's angle ``at`` on and within ``window`` (all
-        rad; 0: the narrowest that fits), with the master at ``speed`` (rad/s) or slower. Parked it is where the
+        rad; 0: one is chosen, see ``WINDOWS``), with the master at ``speed`` (rad/s) or slower. Parked it is where the
         cam is at the window's end. `engage` makes it the law.
 
         Raises MotionError where the way or the parked slave comes too near a singular position or breaks a limit.
@@ -186,23 +191,20 @@ class SlaveLaw:
         start = at % tau
         first: Excess | None = None
         fitting: LawState | None = None
-        for width in (window, *(wider for wider in WINDOWS if wider > window)) if window else WINDOWS:
+        for width, margin in _windows(window):
             state = self._engagement(is_engaged, start, width)
-            way = Piece(state, start, width, WINDOW_POINTS)
-            excess = yield from proof.excess([way], Pace(speed))
-            if excess is None:
+            excess = yield from proof.excess([Piece(state, start, width, WINDOW_POINTS)], Pace(speed), margin)
+            if excess is None and not is_engaged:
+                excess = yield from proof.excess([Piece(_arrived(state), start)], Pace(speed), margin)
+            elif excess is None and (self.shift != 0.0 or speed > self._cam_speed):
                 excess = yield from proof.excess([Piece(_arrived(state), start)], Pace(speed))
             if excess is None:
                 fitting = state
                 break
-            first = first or excess
+            if margin == GRID_MARGIN:
+                first = first or excess
         if fitting is None or (window and first is not None):
-            width = "any window" if not window else f"{degrees(window):.4g} deg"
-            wider = "no wider window fits" if fitting is None else f"{degrees(fitting.end - start):.0f} deg would fit"
-            raise MotionError(
-                f"{'returning to' if is_engaged else 'leaving'} the cam at {degrees(start):.4g} deg within {width} at "
-                f"{speed * 60.0 / tau:.4g} rpm: {first}" + (f"; {wider}" if window else "")
-            )
+            raise EngagementError(is_engaged, start, window, speed, first, fitting)
         return Engagement(is_engaged, fitting, speed)
 
     def engage(self, engagement: "Engagement", theta2: float) -> None:
@@ -260,6 +262,13 @@ class SlaveLaw:
         return self._proof
 
 
+def _windows(window: float) -> Sequence[tuple[float, float]]:
+    """Windows to be looked at, and by what factor each has to stay away from the limits."""
+    if window:
+        return [(window, GRID_MARGIN), *((wider, GRID_MARGIN) for wider in WINDOWS if wider > window)]
+    return [(width, margin) for margin in (EASE, GRID_MARGIN) for width in WINDOWS]
+
+
 def _arrived(state: LawState) -> LawState:
     """The law behind its window."""
     return LawState(state.shift, state.weight_to, state.weight_to, park=state.park)
@@ -272,6 +281,28 @@ class TooFastError(MotionError):
         super().__init__(str(excess))
         self.fastest = fastest
         self.excess = excess
+
+
+class EngagementError(MotionError):
+    """The slave cannot leave its cam, or return, as asked; ``fitting`` (rad) is a wider window that would do."""
+
+    def __init__(
+        self,
+        is_engaged: bool,
+        start: float,
+        window: float,
+        speed: float,
+        excess: Excess | None,
+        fitting: LawState | None,
+    ) -> None:
+        what = "returning to" if is_engaged else "leaving"
+        width = f"{degrees(window):.4g} deg" if window else "any window"
+        wider = "no wider window fits" if fitting is None else f"{degrees(fitting.end - start):.0f} deg would fit"
+        super().__init__(
+            f"{what} the cam at {degrees(start):.4g} deg within {width} at {speed * 60.0 / tau:.4g} rpm: {excess}"
+            + (f"; {wider}" if window else "")
+        )
+        self.fitting = None if fitting is None else fitting.end - start
 
 
 @dataclass(frozen=True, slots=True)

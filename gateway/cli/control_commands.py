@@ -17,7 +17,7 @@ CONTROL_EPILOG = """Examples, while a run of paper is going on in another termin
   drive-gateway control paper phase-shift 5      the slave 5 deg of the master ahead on its cam
   drive-gateway control paper disengage 200      the slave leaves its cam where the master is at 200 deg
   drive-gateway control paper engage 200 --json
-  drive-gateway control paper window 45          from now on it leaves and returns within 45 deg; 0: the narrowest
+  drive-gateway control paper window 45          from now on it leaves and returns within 45 deg; 0: what fits best
 
 Every order is proved against the axes' limits and the singular positions first; a refusal says why, with status 1.
 """

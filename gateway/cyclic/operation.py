@@ -5,6 +5,7 @@ out with limited jerk; one that is refused changes nothing. A proof goes on besi
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum, unique
 from typing import Final
@@ -35,7 +36,7 @@ class Order(IntEnum):
     ENGAGE = 5
     """Master angle in degrees at which it begins to return."""
     WINDOW = 6
-    """Degrees of the master within which the slave leaves or is back, from the next such order on; 0: the narrowest."""
+    """Degrees of the master within which the slave leaves or is back, from the next such order on; 0 leaves it open."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class OrderAnswered(Event):
 @dataclass(frozen=True, slots=True)
 class OperationLimits:
     """Speeds of the master in rad/s: 100 per cent, and the fastest jog; the pace at which a phase is shifted; and the
-    window (rad, 0: the narrowest that fits) within which the slave leaves its cam.
+    window (rad, 0: whichever fits best) within which the slave leaves its cam.
     """
 
     speed: float
@@ -108,24 +109,44 @@ class Operation:
             raise MotionError("the machine is stopping, a new run has to be started")
 
     def _carry_out(self, order: Order, value: float, end: float) -> Work[None]:
-        demand, limits = self._demand, self._limits
-        chosen = max(self._speed, demand.top_speed)
-        # What the operator has not chosen is to hold at the configured speed too, when the override is taken back.
-        speed = max(chosen, limits.speed)
         match order:
             case Order.OVERRIDE:
                 yield from self._override(value, end)
             case Order.JOG:
                 yield from self._jog(value)
             case Order.PHASE_SHIFT:
-                yield from demand.law.change_shift(math.radians(value), speed, limits.shift)
+                yield from self._at_best(lambda speed: self._shift(value, speed))
+            case Order.DISENGAGE | Order.ENGAGE if self._window:
+                yield from self._engage(order, value, self._chosen_speed)
             case Order.DISENGAGE | Order.ENGAGE:
-                way = yield from demand.law.prove_engagement(
-                    order is Order.ENGAGE, math.radians(value), self._window, chosen if self._window else speed
-                )
-                demand.law.engage(way, demand.master_position)
+                yield from self._at_best(lambda speed: self._engage(order, value, speed))
             case Order.WINDOW:
                 self._set_window(value)
+
+    @property
+    def _chosen_speed(self) -> float:
+        """Speed of the master that the operator has chosen, or that it still has."""
+        return max(self._speed, self._demand.top_speed)
+
+    def _at_best(self, work: Callable[[float], Work[None]]) -> Work[None]:
+        """Do it so that it holds at the configured speed too, or else only up to a slower one that is in force."""
+        if self._chosen_speed < self._limits.speed:
+            try:
+                yield from work(self._limits.speed)
+            except MotionError:
+                yield from work(self._chosen_speed)
+        else:
+            yield from work(self._chosen_speed)
+
+    def _shift(self, degrees: float, speed: float) -> Work[None]:
+        yield from self._demand.law.change_shift(math.radians(degrees), speed, self._limits.shift)
+
+    def _engage(self, order: Order, degrees: float, speed: float) -> Work[None]:
+        law, at = self._demand.law, math.radians(degrees)
+        law.engage(
+            (yield from law.prove_engagement(order is Order.ENGAGE, at, self._window, speed)),
+            self._demand.master_position,
+        )
 
     def _override(self, percent: float, end: float) -> Work[None]:
         if not percent >= 0.0:
@@ -159,6 +180,6 @@ class Operation:
         if degrees != 0.0 and not NARROWEST_WINDOW_DEG <= degrees <= WIDEST_WINDOW_DEG:
             raise MotionError(
                 f"a window of {degrees:g} deg is not {NARROWEST_WINDOW_DEG:g} to {WIDEST_WINDOW_DEG:g} deg, or 0 for "
-                "the narrowest that fits"
+                "whichever fits best"
             )
         self._window = math.radians(degrees)

@@ -12,13 +12,17 @@ from gateway.cyclic.torque_offsets import build_feed_forward, torque_violations
 from gateway.errors import GatewayError
 from gateway.running.drive_settings import axis_units
 from gateway.running.machine_session import START_WINDOW_RAD
+from gateway.running.operation_setup import slave_law
 from mechanism.cam import CamLimits, CompiledCam, compile_cam
 from mechanism.cam_profile import CamProfile
 from mechanism.errors import CamLimitError, MechanismError
+from mechanism.law_proof import finish
 from mechanism.motion import MasterPlan, plan_run
+from mechanism.slave_law import EngagementError
 
 RAMP_GRID: Final = 4096
 TORQUE_GRID: Final = 256
+WINDOW_STARTS: Final = 36
 WHOLE_REVOLUTION: Final = 1e-9
 """Share of a revolution that is rounding, and asks for no revolution more."""
 
@@ -78,6 +82,9 @@ def prepare(config: GatewayConfig, machine_cycles: int | None = None, is_strict:
         *_guard_violations(config, cam.profile),
         *torque_violations(config, cam.profile),
     )
+    # A law that breaks limits by itself has no window that would keep them.
+    if not violations:
+        violations = tuple(_window_violations(config, cam.profile))
     if is_strict and violations:
         raise GatewayError("\n".join(str(violation) for violation in violations))
     return PreparedRun(config, cam, plan(config, machine_cycles), violations)
@@ -164,6 +171,30 @@ def _turning_violations(config: GatewayConfig, profile: CamProfile) -> list[Gate
         GatewayError(
             f"axes.{config.axis_names[1]}.limits.position_deg: the servo axis gains {turns} on its cam with every "
             "revolution of the master and would pass any limit, leave it out"
+        )
+    ]
+
+
+def _window_violations(config: GatewayConfig, profile: CamProfile) -> list[GatewayError]:
+    """A window within which the slave cannot leave its cam anywhere."""
+    window_deg = config.motion.engagement_window_deg
+    if window_deg is None:
+        return []
+    law = slave_law(config, profile)
+    fitting: list[float] = []
+    for at in np.linspace(0.0, math.tau, WINDOW_STARTS, endpoint=False).tolist():
+        try:
+            finish(law.prove_engagement(False, at, math.radians(window_deg), config.speed_rad_per_s))
+        except EngagementError as error:
+            if error.fitting is not None:
+                fitting.append(error.fitting)
+        else:
+            return []
+    fits = f", {math.degrees(min(fitting)):.0f} deg would somewhere" if fitting else ""
+    return [
+        GatewayError(
+            f"motion.engagement_window_deg: within {window_deg:g} deg the slave can leave its cam nowhere at "
+            f"{config.motion.speed_rpm:g} rpm{fits}"
         )
     ]
 

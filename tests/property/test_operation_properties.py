@@ -162,7 +162,7 @@ def go_off_the_cam_and_back(percent, off, off_window, on, on_window):
         assert machine.order(Order.WINDOW, window) == ""
         refusal = machine.order(order, at)
         if refusal:
-            # The narrowest window, which the gateway looks for itself, may still do, and then is not the one refused.
+            # Another window, which the gateway looks for itself, may still do, and then is not the one refused.
             assert "deg within " in refusal
             assert "(limit" in refusal or "(bound" in refusal
             machine.order(Order.WINDOW, 0.0)
@@ -176,14 +176,14 @@ def go_off_the_cam_and_back(percent, off, off_window, on, on_window):
 off_and_on = given(st.floats(5.0, 110.0), angles, windows, angles, windows)
 
 
-@settings(deadline=None, derandomize=True, max_examples=10)
+@settings(deadline=None, derandomize=True, max_examples=7)
 @off_and_on
 def test_on_and_off_the_cam_within_any_window_at_any_speed(percent, off, off_window, on, on_window):
     go_off_the_cam_and_back(percent, off, off_window, on, on_window)
 
 
 @pytest.mark.slow
-@settings(deadline=None, derandomize=True, max_examples=120)
+@settings(deadline=None, derandomize=True, max_examples=60)
 @off_and_on
 def test_on_and_off_the_cam_within_any_window_at_any_speed_very_often(percent, off, off_window, on, on_window):
     go_off_the_cam_and_back(percent, off, off_window, on, on_window)
@@ -206,6 +206,17 @@ def test_a_window_too_narrow_for_the_speed_is_refused_with_one_that_fits():
     assert machine.order(Order.OVERRIDE, 100.0) == ""
     machine.go(1.0)
     machine.assert_limits_were_kept()
+
+
+def test_a_window_is_proved_for_the_speed_that_the_master_still_has():
+    machine = Operated().to_speed()
+    machine.order(Order.WINDOW, 20.0)
+    machine.until(lambda: math.degrees(machine.demand.master_position) % 360.0 > 60.0)
+    assert machine.order(Order.OVERRIDE, 30.0) == ""
+    # Still at 60 rpm, and at 100 deg in a moment.
+    assert "within 20 deg at 60 rpm" in machine.order(Order.DISENGAGE, 100.0)
+    machine.go(3.0)
+    assert machine.order(Order.DISENGAGE, 100.0) == ""
 
 
 jogs = st.lists(st.tuples(st.floats(-15.0, 15.0), st.floats(0.05, 1.5)), min_size=2, max_size=6)
@@ -240,7 +251,7 @@ def test_jogs_either_way_keep_the_limits(legs):
 
 
 @pytest.mark.slow
-@settings(deadline=None, derandomize=True, max_examples=150)
+@settings(deadline=None, derandomize=True, max_examples=60)
 @given(jogs)
 def test_jogs_either_way_keep_the_limits_very_often(legs):
     jog(legs)

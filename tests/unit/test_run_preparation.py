@@ -4,6 +4,7 @@ import math
 
 import pytest
 import yaml
+from turning_machine import turning_config
 
 from config.loading import load_config, parse_config
 from gateway.errors import GatewayError
@@ -49,3 +50,17 @@ def test_the_servos_jerk_is_limited_while_the_master_ramps_too():
         prepare(changed(axes={"servo": {"limits": limits}}))
     assert len(str(refusal.value).splitlines()) == 1
     assert "jerk while the master ramps at 6 rad/s^2" in str(refusal.value)
+
+
+@pytest.mark.parametrize(("window", "is_refused"), [(2, True), (60, False)])
+def test_a_window_that_fits_nowhere_is_refused(window, is_refused, tmp_path):
+    """On a cam without a dwell: a slave that turns on has to be stopped within it."""
+    config = turning_config(tmp_path, (("cam_points: 1024", f"cam_points: 1024\n  engagement_window_deg: {window}"),))
+    violations = [str(violation) for violation in prepare(config, is_strict=False).violations]
+    assert bool(violations) is is_refused
+    if is_refused:
+        [sentence] = violations
+        assert sentence.startswith(
+            "motion.engagement_window_deg: within 2 deg the slave can leave its cam nowhere at 45 rpm, "
+        )
+        assert sentence.endswith(" deg would somewhere")

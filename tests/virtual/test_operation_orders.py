@@ -200,9 +200,9 @@ def test_a_quick_stop_with_the_slave_off_its_cam_leaves_it_there():
 
 
 def test_a_slave_that_turns_on_and_on_returns_in_the_revolution_in_which_it_was_parked(tmp_path):
-    run = Operated(config=turning_config(tmp_path), cycles=3).order(1.5, Order.DISENGAGE, 30.0).until(4.0)
+    run = Operated(config=turning_config(tmp_path), cycles=4).order(1.5, Order.DISENGAGE, 30.0).until(4.6)
     parked = run.machine.plant.angle(1)
-    run.order(4.2, Order.ENGAGE, 100.0)
+    run.order(4.8, Order.ENGAGE, 100.0)
     # The master, of whose motion no feed-forward knows, swings it by 1.4 deg.
     assert run.machine.plant.angle(1) == pytest.approx(parked, abs=math.radians(3.0))
     run.to_end()
