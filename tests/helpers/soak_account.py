@@ -89,6 +89,8 @@ class Tally:
     happened: dict[str, Line] = field(default_factory=dict)
     stops: dict[str, Line] = field(default_factory=dict)
     reasons: dict[str, int] = field(default_factory=dict)
+    at_once: dict[int, int] = field(default_factory=dict)
+    """Sessions by how many things have happened in them."""
     unheld: dict[str, int] = field(default_factory=dict)
     """Sessions whose linkage nobody could have held, and why; their figures are in no line."""
     running_deg: Worst = field(default_factory=Worst)
@@ -110,6 +112,7 @@ class Tally:
         self.stops.setdefault(figures.stop, Line()).take(seed, figures)
         reason = "gateway killed" if session.killed_ns is not None else session.core.stopped_by.value
         self.reasons[reason] = self.reasons.get(reason, 0) + 1
+        self.at_once[len(session.fired)] = self.at_once.get(len(session.fired), 0) + 1
         for name in {provocation.name for provocation, _, _ in session.fired} or {NOTHING}:
             self.happened.setdefault(name, Line()).take(seed, figures)
         for provocation, moment, _ in session.fired:
@@ -122,7 +125,11 @@ class Tally:
         for mine, theirs in ((self.happened, other.happened), (self.stops, other.stops)):
             for key, line in theirs.items():
                 mine.setdefault(key, Line()).merge(line)
-        for mine, theirs in ((self.reasons, other.reasons), (self.unheld, other.unheld)):
+        for mine, theirs in (
+            (self.reasons, other.reasons),
+            (self.unheld, other.unheld),
+            (self.at_once, other.at_once),
+        ):
             for reason, count in theirs.items():
                 mine[reason] = mine.get(reason, 0) + count
         self.running_deg.take_most(other.running_deg.value, other.running_deg.seed)
@@ -195,6 +202,8 @@ def table(tally: Tally) -> str:
             lines.append(f"{name:22}" + "".join(f"{line.by_moment.get(moment, 0):12d}" for moment in moments))
     reasons = ", ".join(f"{name} {count}" for name, count in sorted(tally.reasons.items(), key=lambda r: -r[1]))
     lines += ["", f"ended by: {reasons}"]
+    at_once = ", ".join(f"{count} with {number}" for number, count in sorted(tally.at_once.items()))
+    lines.append(f"sessions by what happened in each: {at_once}")
     unheld = ", ".join(f"{why} {count}" for why, count in tally.unheld.items())
     lines.append(f"not judged by where the linkage went: {unheld or 'none'}")
     lines.append(f"from the cam with nothing amiss: at most{_text(tally.running_deg, 6, 2)} deg")

@@ -21,8 +21,10 @@ TWO_COUNTS_RAD = 2.0 * math.tau / 4096
 RUNNING_BOUND_DEG = 1.5
 """From the cam once the machine is at speed, before anything has happened."""
 CONTROLLED_BOUND_DEG = 3.0
-QUICK_BOUND_DEG = 20.0
-QUICK_OF_TWO_BOUND_DEG = 30.0
+QUICK_BOUND_DEG = 6.0
+"""Of a slave that has torque, sees, and is told where the master is."""
+LOST_BOUND_DEG = 20.0
+LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
@@ -41,7 +43,8 @@ BLIND = (FaultKind.FROZEN_RESOLVER, FaultKind.JUMPING_RESOLVER)
 RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
 NO_MOTION_YET = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL)
 MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
-STOPPING = (Mischief.STOP, Mischief.SIGTERM, Mischief.QUICK_STOP, Mischief.KILLED)
+SLAVE_UNABLE = {Mischief.HOST_AWAY, Mischief.HOST_LATE, Mischief.CONTROLLER_OFF}
+"""Nobody tells the slave, for a while, where the master is."""
 ORDERS = tuple(ORDER_OF)
 
 
@@ -50,7 +53,7 @@ class Figures:
     """What the linkage went through; NaN where there was nothing to be measured."""
 
     stop: str
-    """Which stop it was: none, controlled, quick, killed."""
+    """Which stop it was: none, controlled, quick, quick with a slave that could not follow, killed."""
     first_sine: float
     """Where the session began."""
     least_sine: float
@@ -99,7 +102,11 @@ class Judge:
             return "killed"
         if self.stop_ns is None:
             return "none"
-        return "quick" if Phase.QUICK_STOP in self.phases else "controlled"
+        if Phase.QUICK_STOP not in self.phases:
+            return "controlled"
+        others = [p.what for p, _, _ in self.fired if not isinstance(p.what, Fault)]
+        is_able = all(fault.node_id == CV and fault.kind not in BLIND for fault, _ in self.faults)
+        return "quick" if is_able and not set(others) & SLAVE_UNABLE else "quick, slave unable"
 
     def _measure(self) -> Figures:
         session, plant = self.session, self.rig.plant
@@ -131,7 +138,7 @@ class Judge:
         elif not session.is_law_plain:
             after = [value for at_ns, value in session.off_cam if at_ns >= self.stop_ns]
             cam_deg = math.degrees(max(after, default=math.nan))
-        if self.stop == "quick":
+        if self.stop.startswith("quick"):
             # From a controlled stop it may be gone over to a quick one late.
             quick_ns = next(at_ns for at_ns, phase in session.phases if phase is Phase.QUICK_STOP)
             angles = angles[times_ns[stopped] >= quick_ns - QUICK_SHOWN_NS]
@@ -253,11 +260,11 @@ class Judge:
             self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
         if self.stop == "none":
             return
-        quick = QUICK_BOUND_DEG if len(self.fired) < 2 else QUICK_OF_TWO_BOUND_DEG
-        bound = (CONTROLLED_BOUND_DEG if self.stop == "controlled" else quick) + self._jumped_deg()
+        lost = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
+        bound = {"controlled": CONTROLLED_BOUND_DEG, "quick": QUICK_BOUND_DEG}.get(self.stop, lost) + self._jumped_deg()
         if figures.cam_deg > bound:
             self._say(f"{figures.cam_deg:.1f} deg from the cam in a {self.stop} stop (bound {bound:.1f})")
-        rest = {"controlled": CONTROLLED_REST_S, "quick": QUICK_REST_S, "killed": KILLED_REST_S}[self.stop]
+        rest = {"controlled": CONTROLLED_REST_S, "killed": KILLED_REST_S}.get(self.stop, QUICK_REST_S)
         if figures.rest_s > rest:
             self._say(f"at rest {figures.rest_s:.2f} s after a {self.stop} stop was called for (bound {rest:g})")
         off = KILLED_TORQUE_OFF_S if self.stop == "killed" else rest + TORQUE_OFF_AFTER_REST_S
