@@ -2,12 +2,16 @@
 
 The protocol is that of the program socketcand (https://github.com/linux-can/socketcand), as far as its raw mode goes:
 the client says ``< open NAME >``, ``< rawmode >`` and ``< send ID LENGTH BYTES >``, the server answers ``< ok >`` or
-``< error ... >`` and tells every frame as ``< frame ID SECONDS.MICROSECONDS HEXDATA >``.
+``< error ... >`` and tells every frame as ``< frame ID SECONDS.MICROSECONDS HEXDATA >``. Beyond that
+program, ``< wire >`` is answered with ``< wire none >``: behind this server frames take no time.
 """
 
 import re
 from enum import Enum
 from typing import Final, NamedTuple
+
+from drivers.socketcand_word import COMMAND as WIRE_COMMAND
+from drivers.socketcand_word import NO_WIRE
 
 GREETING: Final = b"< hi >"
 MAX_COMMAND_BYTES: Final = 256
@@ -98,6 +102,8 @@ class SocketcandSession:
                 self._output += _OK
             case "echo", _:
                 self._output += b"< echo >"
+            case command, _ if command == WIRE_COMMAND:
+                self._output += NO_WIRE
             case (("send" | "rawmode"), SessionState.NO_BUS):
                 self._refuse("no bus is open")
             case (("open" | "rawmode"), _):

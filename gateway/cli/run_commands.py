@@ -45,7 +45,8 @@ RUN_EPILOG = """Examples:
   drive-gateway run paper --virtual-time --seed 1 --json   gateway and emulator in virtual time
   drive-gateway run paper --learn memory.json              learn from cycle to cycle, go on where the last run ended
 
-The first Ctrl-C stops the machine on the cam, a second one with a quick stop.
+The first Ctrl-C does what guard.sigint says (by default a controlled stop: the master ramps down, the slave stays on
+the cam). A second one is a quick stop: the master's drive stops on its own ramp, the slave stays on the cam meanwhile.
 """
 DEMO_EPILOG = """Examples:
 

@@ -1,24 +1,35 @@
 """The bus budget as `drive-gateway check` shows it, and the refusal of a run whose budget is not that of its bus."""
 
+import ipaddress
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 from rich.table import Table
 
-from config.bus_budget import MAX_BUS_LOAD
+from config.bus_budget import MAX_BUS_LOAD, deadline_without_wire_us
 from config.schema import GatewayConfig
+from drivers.socketcand_word import says_no_wire
 from gateway.errors import GatewayError
 from gateway.running.bus_address import BusAddress
 
 _NETWORK_INTERFACES: Final = Path("/sys/class/net")
-WITHOUT_WIRE: Final = frozenset({"socketcand", "virtual"})
-"""Interfaces of python-can on which a frame takes no time: TCP on loopback, and in process."""
 
 
-def has_wire(address: BusAddress, root: Path = _NETWORK_INTERFACES) -> bool:
-    """Whether frames take their time on this bus; vcan and loopback have no bit rate."""
-    if address.interface in WITHOUT_WIRE:
+def has_wire(
+    address: BusAddress,
+    root: Path = _NETWORK_INTERFACES,
+    says_no_wire: Callable[[str, int], bool] = says_no_wire,
+) -> bool:
+    """Whether frames take their time on this bus; in doubt they do.
+
+    They take none in this process, on an interface that the kernel calls virtual, and behind a socketcand server on
+    this machine that says so itself, as ``sim-drive`` does: any other such server may stand before a real bus.
+    """
+    if address.interface == "virtual":
         return False
+    if address.interface == "socketcand":
+        return not (_is_loopback(address.host) and says_no_wire(address.host, address.port))
     if address.interface != "socketcan":
         return True
     try:
@@ -27,14 +38,28 @@ def has_wire(address: BusAddress, root: Path = _NETWORK_INTERFACES) -> bool:
         return True
 
 
-def require_budget(config: GatewayConfig, address: BusAddress) -> None:
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def require_budget(config: GatewayConfig, address: BusAddress, is_wired: bool) -> None:
     """Raises GatewayError for a configuration that is for virtual channels alone, on a bus that is none."""
     budget = config.budget
-    if config.bus.is_virtual and not budget.is_within_bound and has_wire(address):
-        raise GatewayError(
-            f"bus.is_virtual: {address} is a real bus, on which a cycle of {budget.cycle_us} us is taken to "
-            f"{budget.load:.0%} (bound {MAX_BUS_LOAD:.0%}); {budget.shortest_cycle_us} us would fit"
-        )
+    if not (config.bus.is_virtual and is_wired) or budget.is_within_bound:
+        return
+    what = "may stand before a real bus" if address.interface == "socketcand" else "is a real bus"
+    raise GatewayError(
+        f"bus.is_virtual: {address} {what}, on which a cycle of {budget.cycle_us} us is taken to "
+        f"{budget.load:.0%} (bound {MAX_BUS_LOAD:.0%}); {budget.shortest_cycle_us} us would fit"
+    )
+
+
+def tpdo_deadline_us(config: GatewayConfig, is_wired: bool) -> float:
+    """How long after SYNC the TPDOs are waited for on a bus, whatever the configuration takes that for."""
+    return config.budget.tpdo_deadline_us if is_wired else deadline_without_wire_us(config.bus.cycle_us)
 
 
 def budget_json(config: GatewayConfig) -> dict[str, Any]:

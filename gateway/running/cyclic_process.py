@@ -15,7 +15,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from config.bus_budget import deadline_without_wire_us
 from config.loading import parse_config
 from config.schema import GatewayConfig
 from drivers.bus_off import Restarter, RestartSettings
@@ -34,7 +33,7 @@ from gateway.record.order_word import unpack_order
 from gateway.record.ring import RingWriter, RunState, StopRequest
 from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
-from gateway.running.bus_budget import has_wire
+from gateway.running.bus_budget import tpdo_deadline_us
 from gateway.running.child_process import end_with
 from gateway.running.controller_watch import ControllerWatch
 from gateway.running.core import GatewayCore
@@ -67,6 +66,8 @@ class CyclicJob:
     port: int
     bit_rate: int | None
     parent_pid: int
+    is_wired: bool = True
+    """Frames take their time on the bus, see `gateway.running.bus_budget.has_wire`."""
     is_homing_again: bool = False
     is_starting_anywhere: bool = False
     learn: str | None = None
@@ -176,6 +177,13 @@ def tell_setting(ring: RingWriter, setting: RealTimeSetting) -> None:
     ring.append_event(time.monotonic_ns(), "realtime", text, is_on=setting.is_on)
 
 
+def tell_bus(ring: RingWriter, config: GatewayConfig, address: BusAddress, is_wired: bool) -> None:
+    """What the bus was taken for, which sets the TPDOs' deadline, is an event of the run."""
+    taken = "taken for a bus with a wire" if is_wired else "frames take no time there"
+    text = f"{address}: {taken}, TPDOs are waited for until {tpdo_deadline_us(config, is_wired):.0f} us after SYNC"
+    ring.append_event(time.monotonic_ns(), "bus", text, is_wired=is_wired)
+
+
 def join_bus(address: BusAddress, config: GatewayConfig, ring: RingWriter) -> CycleBus:
     """Listen whether the bus is free, and open what the cycle needs. Raises BusError and GatewayError."""
     listener = address.open()
@@ -238,7 +246,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
         time.thread_time_ns,
         job.is_homing_again,
         None if store is None else store.learning(),
-        None if has_wire(address) else deadline_without_wire_us(config.bus.cycle_us),
+        tpdo_deadline_us(config, job.is_wired),
         job.machine_cycles if job.is_starting_anywhere else None,
     )
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -269,6 +277,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     stopped_by = StopReason.BUS_LOST
     try:
         bus = join_bus(address, config, ring)
+        tell_bus(ring, config, address, job.is_wired)
         ring.set_state(RunState.RUNNING)
         recovery = config.recovery
         restart = RestartSettings(recovery.restart_delay_ms * 1e-3, recovery.max_restarts)

@@ -20,7 +20,7 @@ from gateway.errors import GatewayError
 from gateway.record.ring import RingReader, RingWriter, RunState, StopRequest
 from gateway.record.run_constants import RunConstants
 from gateway.running.bus_address import BusAddress
-from gateway.running.bus_budget import require_budget
+from gateway.running.bus_budget import has_wire, require_budget
 from gateway.running.cyclic_process import CyclicJob
 from gateway.running.preparation import PreparedRun
 
@@ -118,9 +118,10 @@ def run_realtime(
     config = prepared.config
     constants = RunConstants.from_config(config, prepared.cam.closure)
     failures: list[str] = []
-    require_budget(config, address)
     # A bus that is not there is told before a recording is begun.
     address.open().close()
+    is_wired = has_wire(address)
+    require_budget(config, address, is_wired)
     start_ns = time.monotonic_ns()
     start_wall_ns = time.time_ns()
     with RingWriter.create(config.name, constants) as ring, tempfile.TemporaryDirectory() as folder:
@@ -155,6 +156,7 @@ def run_realtime(
             port=address.port,
             bit_rate=address.bit_rate,
             parent_pid=os.getpid(),
+            is_wired=is_wired,
             is_homing_again=is_homing_again,
             is_starting_anywhere=is_starting_anywhere,
             learn=None if learn is None else str(learn.absolute()),

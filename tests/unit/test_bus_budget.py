@@ -1,6 +1,9 @@
 """The bus budget by hand, its refusals, and SDO held to its share."""
 
+import contextlib
 import json
+import socket
+import threading
 
 import pytest
 import yaml
@@ -10,13 +13,15 @@ from hypothesis import strategies as st
 from config.bus_budget import bus_budget, deadline_without_wire_us, representable_cycle_us
 from config.loading import ConfigError, load_config, parse_config
 from drivers.frame import Frame
+from drivers.socketcand_word import says_no_wire
 from gateway.cli.cam_commands import check
 from gateway.cyclic.sdo_pacing import SdoPacing
 from gateway.errors import GatewayError
 from gateway.running.assembly import build_core
 from gateway.running.bus_address import BusAddress
-from gateway.running.bus_budget import budget_json, has_wire, require_budget
+from gateway.running.bus_budget import budget_json, has_wire, require_budget, tpdo_deadline_us
 from gateway.running.preparation import prepare
+from sim_drive.socketcand_session import SessionState, SocketcandSession
 
 CONFIG = load_config("paper")
 
@@ -85,13 +90,86 @@ def test_a_cycle_of_600_us_is_allowed_where_frames_take_no_time_and_refused_on_a
     net.mkdir()
     (net / "vcan0").symlink_to(tmp_path / "devices" / "virtual" / "net" / "vcan0")
     (net / "can0").symlink_to(tmp_path / "devices" / "pci0" / "net" / "can0")
-    places = {("socketcand", "vcan0"): False, ("virtual", "x"): False, ("socketcan", "vcan0"): False}
-    places |= {("socketcan", "can0"): True, ("socketcan", "gone"): True, ("pcan", "PCAN_USBBUS1"): True}
+    places = {("virtual", "x"): False, ("socketcan", "vcan0"): False, ("socketcan", "can0"): True}
+    places |= {("socketcan", "gone"): True, ("pcan", "PCAN_USBBUS1"): True}
     for (interface, channel), expected in places.items():
         assert has_wire(BusAddress(interface, channel, "", 0), net) is expected, (interface, channel)
-    require_budget(config, BusAddress("socketcand", "vcan0", "127.0.0.1", 1))
     with pytest.raises(GatewayError, match=r"bus\.is_virtual: pcan X is a real bus, .* 600 us is taken to 145%"):
-        require_budget(config, BusAddress("pcan", "X", "", 0))
+        require_budget(config, BusAddress("pcan", "X", "", 0), True)
+    with pytest.raises(GatewayError, match=r"socketcand 127\.0\.0\.1:1 may stand before a real bus, on which"):
+        require_budget(config, BusAddress("socketcand", "vcan0", "127.0.0.1", 1), True)
+    require_budget(config, BusAddress("socketcand", "vcan0", "127.0.0.1", 1), False)
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost"])
+def test_a_socketcand_server_on_this_machine_is_taken_at_its_word_and_no_other(host):
+    def server(name):
+        return BusAddress("socketcand", "vcan0", name, 29536)
+
+    assert not has_wire(server(host), says_no_wire=lambda *_: True)
+    assert has_wire(server(host), says_no_wire=lambda *_: False)
+    for far in ("192.0.2.7", "can-server.example", "0.0.0.0"):
+        assert has_wire(server(far), says_no_wire=lambda *_: pytest.fail("nobody need be asked")), far
+
+
+@pytest.mark.parametrize("is_virtual", [False, True])
+def test_the_deadline_is_the_buses_whatever_the_configuration_takes_it_for(is_virtual):
+    config = with_bus(is_virtual=is_virtual)
+    assert tpdo_deadline_us(config, True) == pytest.approx(545.0)
+    assert tpdo_deadline_us(config, False) == pytest.approx(750.0)
+
+
+@contextlib.contextmanager
+def answering(*answers):
+    """A server that greets, hears one thing and gives the last of ``answers``; its port and what it has heard."""
+    heard = []
+
+    def serve(listener):
+        connection, _ = listener.accept()
+        with connection:
+            connection.sendall(answers[0])
+            if len(answers) > 1:
+                heard.append(connection.recv(256))
+                connection.sendall(answers[1])
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=serve, args=(listener,))
+        thread.start()
+        yield listener.getsockname()[1], heard
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("answers", "expected"),
+    [
+        ((b"< hi >", b"< wire none >"), True),
+        ((b"< hi >", b"< error unknown command >"), False),
+        ((b"< hi >", b"< wire 500000 >"), False),
+        ((b"< hi >", b""), False),
+        ((b"",), False),
+    ],
+)
+def test_a_server_that_does_not_say_that_it_has_no_wire_has_one(answers, expected):
+    with answering(*answers) as (port, heard):
+        assert says_no_wire("127.0.0.1", port) is expected
+        assert heard in ([], [b"< wire >"])
+
+
+def test_nobody_there_and_nobody_who_answers_have_a_wire():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        assert not says_no_wire("127.0.0.1", port, timeout_s=0.01)
+    assert not says_no_wire("127.0.0.1", port)
+
+
+def test_the_emulators_server_gives_its_word():
+    session = SocketcandSession("vcan0")
+    session.take_output()
+    assert session.receive_data(b"< wire >") == []
+    assert session.take_output() == b"< wire none >"
+    assert session.state is SessionState.NO_BUS, "the greeting goes on as if nothing had been asked"
+    session.receive_data(b"< open vcan0 >< wire >< rawmode >")
+    assert session.take_output() == b"< ok >< wire none >< ok >"
 
 
 def test_check_prints_the_budget_as_a_table_and_as_json(capsys):
