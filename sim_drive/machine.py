@@ -59,7 +59,6 @@ class _Station:
     """One drive on the bus, and the motors that it has."""
 
     __slots__ = (
-        "after_servo_tick",
         "drive",
         "due_ns",
         "events",
@@ -82,7 +81,6 @@ class _Station:
         # Looked up once: they are asked for at every frame and tick.
         self.receive = drive.receive
         self.next_wake_ns = drive.next_wake_ns
-        self.after_servo_tick = drive.after_servo_tick
         self.outbox = drive.outbox
         self.events = drive.events
 
@@ -324,8 +322,9 @@ class EmulatedMachine:
                 index = motor.index
                 self._torques[index] = motor.run(now_ns, angle(index))
                 self._brakes[index] = motor.is_braked
-            station.after_servo_tick(now_ns)
             drive = station.drive
+            if drive.watches_events:
+                drive.after_servo_tick(now_ns)
             if drive.is_wake_stale:
                 self._ask_wake(station)
             if station.outbox or station.events or drive.subscriptions_changed:
@@ -352,7 +351,8 @@ class EmulatedMachine:
                         frames = [told for frame in frames for told in station.tap.tell(frame, now_ns)]
                     self._frames += frames
                     for frame in frames:
-                        if frame.cob_id in self._routes:
+                        cob_id, _, _ = frame
+                        if cob_id in self._routes:
                             is_quiet = False
                             self._tell_others(station, frame, now_ns)
             # Drives that answer each other without end go on at the next tick: on a wire it would cost them time too.

@@ -61,6 +61,11 @@ class MachineDrive(Protocol):
         ...
 
     @property
+    def watches_events(self) -> bool:
+        """Whether `after_servo_tick` has anything to do."""
+        ...
+
+    @property
     def axes(self) -> Sequence[DriveAxis]: ...
     @property
     def outbox(self) -> list[Frame]:

@@ -126,6 +126,8 @@ class Drive:
         self.outbox: list[Frame] = []
         self.events: list[Event] = []
         self.dictionary: Final = LiveDictionary(dictionary)
+        self.watches_events = False
+        """Whether ``after_servo_tick`` has anything to do."""
         self.subscriptions_changed = True
         """Set whenever ``cob_ids`` gives something else than before; whoever re-reads it sets it back."""
 
@@ -273,7 +275,7 @@ class Drive:
 
     def after_servo_tick(self, now_ns: int) -> None:
         """Every axis has had its servo tick: see what event-driven TPDOs make of it."""
-        if self._pdos.event_tpdos and self._pdos.is_operational:
+        if self.watches_events:
             self._pdos.poll(now_ns)
 
     def on_servo_tick(self, now_ns: int, *shaft_counts: int) -> None:
@@ -465,6 +467,7 @@ class Drive:
         self._emergency.is_silent = state in {NmtState.STOPPED, NmtState.BOOT_UP}
         self._sdo.reset()
         self._pdos.enter(state is NmtState.OPERATIONAL, now_ns)
+        self.watches_events = self._pdos.watches_events
 
     # -- subscriptions -------------------------------------------------------------------------------------------
 
@@ -480,6 +483,7 @@ class Drive:
         _add(handlers, SDO_REQUEST_BASE + self.node_id, self._on_sdo)
         _add(handlers, NMT_COB_ID, self._on_nmt)
         self._handlers = handlers
+        self.watches_events = self._pdos.watches_events
         self._request_handlers = self._pdos.request_handlers()
         self._request_handlers[HEARTBEAT_BASE + self.node_id] = self._on_guard_request
         self.is_wake_stale = True

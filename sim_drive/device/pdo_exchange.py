@@ -56,6 +56,7 @@ class PdoExchange:
         "_waiting_tpdos",
         "event_tpdos",
         "is_operational",
+        "watches_events",
     )
 
     def __init__(
@@ -101,6 +102,8 @@ class PdoExchange:
         self._sync_at_ns: int | None = None
         """The last SYNC, noted while there is a synchronous window; None before the first."""
         self.is_operational = False
+        self.watches_events = False
+        """Whether ``poll`` has anything to do."""
 
     def restore(self, now_ns: int) -> None:
         """Begin anew with what the dictionary holds; ``rearrange`` has to follow."""
@@ -118,11 +121,13 @@ class PdoExchange:
                 if tpdo.is_valid:
                     tpdo.begin(now_ns)
             self._sort_synchronous_tpdos()
+        self.watches_events = is_operational and bool(self.event_tpdos)
 
     def rearrange(self, now_ns: int) -> None:
         """A PDO has been configured: see anew what concerns which."""
         self._sort_synchronous_tpdos()
         self.event_tpdos = tuple(tpdo for tpdo in self._tpdos if _is_used(tpdo) and tpdo.is_event_driven)
+        self.watches_events = self.is_operational and bool(self.event_tpdos)
         self._monitored_rpdos = tuple(rpdo for rpdo in self._rpdos if _is_used(rpdo) and rpdo.event_ns)
         if not any(rpdo.is_late for rpdo in self._rpdos):
             self._emergency.end_cause(EmergencyCode.RPDO_TIMEOUT, now_ns)

@@ -2,15 +2,12 @@
 
 import struct
 from collections.abc import Callable, Sequence
-from operator import attrgetter
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from drivers import objects
+from drivers.frame import Frame, new_frame
 from drivers.object_dictionary import FORMAT
 from sim_drive.communication.dictionary import Entry
-
-_value_of: Final = attrgetter("value")
-"""Of a dictionary's entry."""
 
 
 class Codec(Protocol):
@@ -81,16 +78,16 @@ def compile_mapping(mapped: Sequence[Entry]) -> tuple[tuple[Entry, ...], int, Co
     return real, length, BitCodec(fields, length)
 
 
-def compile_encoder(entries: Sequence[Entry], pack: Callable[..., bytes]) -> Callable[[], bytes]:
-    """What packs the values that the entries have by then; most PDOs carry no more than three."""
+def compile_encoder(entries: Sequence[Entry], pack: Callable[..., bytes], cob_id: int) -> Callable[[], Frame]:
+    """What makes a PDO's frame of the values that the entries have by then; most PDOs carry no more than three."""
     if len(entries) == 1:
         (only,) = entries
-        return lambda: pack(only.value)
+        return lambda: new_frame(Frame, (cob_id, pack(only.value), False))
     if len(entries) == 2:
         first, second = entries
-        return lambda: pack(first.value, second.value)
+        return lambda: new_frame(Frame, (cob_id, pack(first.value, second.value), False))
     if len(entries) == 3:
         first, second, third = entries
-        return lambda: pack(first.value, second.value, third.value)
-    values = tuple(entries)
-    return lambda: pack(*map(_value_of, values))
+        return lambda: new_frame(Frame, (cob_id, pack(first.value, second.value, third.value), False))
+    mapped = tuple(entries)
+    return lambda: Frame(cob_id, pack(*[entry.value for entry in mapped]))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from drivers import objects
-from drivers.frame import Frame, data_frame
+from drivers.frame import Frame
 from drivers.pdo import PDO_COB_ID_NO_RTR
 from drivers.sdo import AbortCode
 from sim_drive.communication.dictionary import Entry, LiveDictionary
@@ -69,14 +69,14 @@ class TransmitPdo(SlavePdo):
         self._inhibit_entry.on_write = self._on_inhibit_time
         self._start_entry.on_write = self._on_start_value
         self._event_entry.on_write = self._on_event_timer
-        self._encode: Callable[[], bytes] = _encode_nothing
+        self._encode: Callable[[], Frame] = _encode_nothing
         self._sources: tuple[Entry, ...] = ()
         self._last_sources: list[Any] = []
         self._inhibit_ns = 0
         self._event_ns = 0
         self._sync_count = 0
         self._is_pending = False
-        self._sampled: bytes | None = None
+        self._sampled: Frame | None = None
         self.has_started = False
         """The SYNC whose counter is the start value has come, since the node became operational."""
         self.is_event_driven = False
@@ -85,7 +85,7 @@ class TransmitPdo(SlavePdo):
         self.inhibited_until_ns = 0
 
     def _take_codec(self, codec: Codec) -> None:
-        self._encode = compile_encoder(self.entries, codec.pack)
+        self._encode = compile_encoder(self.entries, codec.pack, self.cob_id)
         self._sources = tuple(entry for entry in self.entries if in_first_axis(entry.variable.index) not in _MEASURED)
 
     def _start(self, now_ns: int) -> None:
@@ -122,7 +122,7 @@ class TransmitPdo(SlavePdo):
     def send(self, now_ns: int) -> None:
         """Send the PDO with the values as they are."""
         encode = self._encode
-        self._outbox.append(data_frame(self.cob_id, encode()))
+        self._outbox.append(encode())
 
     @property
     def sync_sender(self) -> Callable[[int], None]:
@@ -149,7 +149,7 @@ class TransmitPdo(SlavePdo):
             self._sample(now_ns)
             self.send(now_ns)
         elif self._sampled is not None:
-            self._outbox.append(data_frame(self.cob_id, self._sampled))
+            self._outbox.append(self._sampled)
 
     def poll(self, now_ns: int) -> bool:
         """Event-driven: send if something has changed; gives whether ``due_ns`` may have changed."""
@@ -205,5 +205,5 @@ class TransmitPdo(SlavePdo):
         return None
 
 
-def _encode_nothing() -> bytes:
-    return b""
+def _encode_nothing() -> Frame:
+    return Frame(0)

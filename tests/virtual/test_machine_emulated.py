@@ -54,6 +54,7 @@ class FakeDrive:
         self.wakes_ns: list[int] = []
         self.trips: list[int] = []
         self.keeps_waking = False
+        self.watches_events = True
 
     def power(self, on: bool = True) -> None:
         self.is_powered = on
