@@ -50,14 +50,15 @@ class OrderAnswered(Event):
 
 @dataclass(frozen=True, slots=True)
 class OperationLimits:
-    """Speeds of the master in rad/s: 100 per cent, and the fastest jog; the pace at which a phase is shifted; and the
-    window (rad, 0: whichever fits best) within which the slave leaves its cam.
+    """Speeds of the master in rad/s: 100 per cent, and the fastest jog; the pace at which a phase is shifted; the
+    window (rad, 0: whichever fits best) within which the slave leaves its cam; and passes of a proof in a cycle.
     """
 
     speed: float
     jog_speed: float
     shift: Pace
     window: float = 0.0
+    passes: int = 1
 
 
 class Operation:
@@ -90,12 +91,13 @@ class Operation:
         return self.go_on(now_ns)
 
     def go_on(self, now_ns: int) -> OrderAnswered | None:
-        """One pass of the proof; the answer if it was the last one."""
+        """What a cycle has time for of the proof; the answer if it was the last of it."""
         refusal = ""
         try:
             if self._work is not None:
                 self._refuse_a_stop()
-                next(self._work)
+                for _ in range(self._limits.passes):
+                    next(self._work)
                 return None
         except StopIteration:
             pass

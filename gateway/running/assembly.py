@@ -146,9 +146,10 @@ def build_core(
 def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: int) -> Approach:
     """How a machine gets onto its cam from anywhere, and the run that it then makes.
 
-    Raises mechanism.errors.ApproachError for a cam that has no approach.
+    Raises mechanism.errors.ApproachError for position limits of a slave that gains turns on its cam.
     """
-    position = config.ordered_axes[1].limits.position_deg
+    slave = config.ordered_axes[1].limits
+    position = slave.position_deg
     motion = config.motion
     return Approach(
         ApproachField(
@@ -162,7 +163,9 @@ def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: i
             [axis_units(axis) for axis in config.ordered_axes],
             config.cycle_s,
             ApproachLimits(
-                motion.approach_speed_rad_per_s, motion.ramp_acceleration_rad_per_s2, motion.ramp_jerk_rad_per_s3
+                motion.approach_speed_rad_per_s,
+                min(motion.ramp_acceleration_rad_per_s2, slave.acceleration_rad_per_s2),
+                min(motion.ramp_jerk_rad_per_s3, slave.jerk_rad_per_s3 or math.inf),
             ),
         ),
         lambda start: plan(config, machine_cycles, start),

@@ -247,6 +247,8 @@ class MachineSession:
                     loop.controlled_stop()
                 yield self.master.now_ns + NS_PER_S
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self.is_stop_requested else StopReason.COMPLETED)
+        if self.stopped_by is StopReason.COMPLETED and not demand.law.is_plain:
+            self._step("the slave ends off its cam: give the next run --from-here")
         if loop.phase is Phase.QUICK_STOP:
             self._step("quick stop")
         else:

@@ -12,6 +12,8 @@ from mechanism.slave_law import SlaveLaw
 
 JOG_SHARE: Final = 4.0
 """A jog is at most so many times slower than the run."""
+PASS_US: Final = 1000
+"""Of a cycle's time, for each pass of a proof: some 65 us."""
 PERMILLE: Final = 1000.0
 
 
@@ -53,4 +55,5 @@ def operation_limits(config: GatewayConfig) -> OperationLimits:
         config.speed_rad_per_s / JOG_SHARE,
         Pace(0.0, motion.approach_speed_rad_per_s, motion.ramp_acceleration_rad_per_s2, motion.ramp_jerk_rad_per_s3),
         math.radians(motion.engagement_window_deg or 0.0),
+        max(config.bus.cycle_us // PASS_US, 1),
     )
