@@ -5,9 +5,11 @@ import itertools
 import pytest
 from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
 from test_approach_from_anywhere import Again
+from test_guard_conditions import MOTION, PHASE_AT_S
 
 from drivers.cia402 import State, state_of
 from drivers.master import BootUpReceived, EmergencyReceived
+from gateway.cyclic.guard import StopReason
 from gateway.record.sample import Phase
 from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
@@ -99,11 +101,68 @@ def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, t
     assert_at_rest(run)
 
 
+LOSSES = {
+    FaultKind.POWER_CYCLE: (0.7, StopReason.AXIS_SILENT, f"commissioned anew, {LOST_REFERENCE}"),
+    FaultKind.NODE_RESET: (None, StopReason.HEARTBEAT_LOST, f"commissioned anew, {LOST_REFERENCE}"),
+    FaultKind.BUS_OFF: (0.3, StopReason.AXIS_SILENT, "commissioned anew, fault reset, ready for a new run"),
+    FaultKind.OVER_CURRENT: (None, StopReason.EMERGENCY, "fault reset, ready for a new run"),
+}
+"""By kind: how long it lasts, why the run is then said to end, and what becomes of the axis."""
+
+
 @pytest.mark.slow
-def test_an_axis_without_a_reference_is_not_homed_away_from_home():
-    run, _ = recover(Fault(FaultKind.NODE_RESET, SERVO, AT_S))
+@pytest.mark.parametrize("phase", MOTION)
+@pytest.mark.parametrize(("node", "name", "other"), [(CV, "cv", "servo"), (SERVO, "servo", "cv")])
+@pytest.mark.parametrize("kind", LOSSES)
+def test_either_axis_may_be_lost_in_any_phase(kind, node, name, other, phase):
+    for_s, reason, text = LOSSES[kind]
+    at_s = PHASE_AT_S[phase]
+    frames = []
+    run = Guarded(Fault(kind, node, at_s, for_s), trace=lambda at_ns, frame: frames.append((at_ns, frame))).to_end()
+    frames = [(at_ns, frame) for at_ns, frame in frames if at_ns >= at_s * 1e9]
+    assert run.stopped_by is reason
+    assert run.core.failure is None
+    assert {axis: event.text for axis, event in outcomes(run).items()} == {name: text, other: "ready for a new run"}
+    is_anew = kind is not FaultKind.OVER_CURRENT
+    assert (restarts_of(frames, node), restarts_of(frames, CV + SERVO - node)) == (is_anew, 0)
+    assert resets_of(frames, CV + SERVO - node) == 0
+    assert resets_of(frames, node) == ("fault reset" in text)
+    assert not run.is_torn
+    assert_at_rest(run)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [FaultKind.POWER_CYCLE, FaultKind.NODE_RESET, FaultKind.BUS_OFF])
+@pytest.mark.parametrize(("node", "name"), [(CV, "cv"), (SERVO, "servo")])
+@pytest.mark.parametrize("phase", ["commissioning", "enabling"])
+def test_an_axis_that_is_lost_before_the_motion_ends_the_run_without_any(kind, node, name, phase):
+    run = Guarded(Fault(kind, node, PHASE_AT_S[phase], LOSSES[kind][0])).to_end()
+    assert run.stopped_by is StopReason.COMMISSIONING
+    assert f"axis {name}: node {node}" in str(run.core.failure)
+    assert run.phases <= {Phase.COMMISSIONING, Phase.DISABLED}
+    assert run.is_without_torque
+
+
+@pytest.mark.slow
+def test_a_machine_that_has_lost_all_references_runs_again_from_home():
+    """The supply of the whole cabinet fails: both axes are homed again, once somebody has brought the linkage home."""
+    run, _ = recover(Fault(FaultKind.POWER_CYCLE, CV, AT_S, 0.7), Fault(FaultKind.POWER_CYCLE, SERVO, AT_S, 0.7))
+    assert {event.text for event in outcomes(run).values()} == {f"commissioned anew, {LOST_REFERENCE}"}
+    assert not any(event.is_ready for event in outcomes(run).values())
+    assert_at_rest(run)
+    again = Again(run, 0.0, 0.0).to_end()
+    steps = [event.step for event in again.events if isinstance(event, StepReached)]
+    assert {"homing axis cv", "homing axis servo"} <= set(steps)
+    assert not any("homed already" in step or "approaching" in step for step in steps)
+    assert (again.core.failure, again.core.stopped_by) == (None, StopReason.COMPLETED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("node", "lost", "kept"), [(CV, "cv", "servo"), (SERVO, "servo", "cv")])
+def test_an_axis_without_a_reference_is_not_homed_away_from_home(node, lost, kept):
+    run, _ = recover(Fault(FaultKind.NODE_RESET, node, AT_S))
     again = Again(run).to_end()
-    assert "axis servo has lost its reference while axis cv stands" in str(again.core.failure)
+    assert f"axis {lost} has lost its reference while axis {kept} stands" in str(again.core.failure)
     assert not any(drive.is_powered for drive in again.machine.drives)
     assert Phase.APPROACH not in {Phase(int(sample[12])) for sample in again.samples}
 
