@@ -135,7 +135,7 @@ class GuardSection(Model):
     """The statusword is not that of Operation enabled."""
     heartbeat_lost: ConditionSection = ConditionSection(reaction=_QUICK)
     bus_off: ConditionSection = ConditionSection(persistence_cycles=20, reaction=_QUICK)
-    """No drive is heard at all, or the gateway's own controller has left the bus."""
+    """No drive is heard at all for so long, or, at once, the gateway's own controller has left the bus."""
     sync_lost: CyclesCondition = CyclesCondition(limit_cycles=5, reaction=_QUICK)
     """So many SYNCs in a row have not been sent, as after a host that was away: the drives stand meanwhile."""
     operator_stop: StopSection = StopSection()

@@ -25,6 +25,8 @@ SAMPLE_POINTS: Final = (0.85, 0.90)
 """CiA 301 wants the sample point at 87.5 % of the bit, or close to it."""
 LEAST_QUEUE: Final = 32
 """Frames that a transmit queue should hold; the kernel's own default for CAN, 10, is a burst of SDO."""
+LEAST_RESTART_MS: Final = 50
+"""Drives that miss SYNC have stopped by then; before, frames from before bus-off would move them."""
 _CAP_NET_ADMIN: Final = 12
 _CAP_IPC_LOCK: Final = 14
 _CAP_SYS_NICE: Final = 23
@@ -334,6 +336,11 @@ def _sample_point(name: str, data: dict[str, Any]) -> Finding:
 def _restart(name: str, data: dict[str, Any], root: Path) -> Finding:
     topic = Topic.RESTART
     restart_ms = data.get("restart_ms", 0)
+    if isinstance(restart_ms, int) and 0 < restart_ms < LEAST_RESTART_MS:
+        remedy = f"ip link set {name} type can restart-ms 100, with the interface down: the drives have to stop before"
+        return Finding(
+            topic, name, Verdict.ADVICE, f"after {restart_ms} ms, queued frames then still move drives", remedy
+        )
     if isinstance(restart_ms, int) and restart_ms > 0:
         return Finding(topic, name, Verdict.GOOD, f"after {restart_ms} ms")
     remedy = f"ip link set {name} type can restart-ms 100, with the interface down"

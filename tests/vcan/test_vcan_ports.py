@@ -17,6 +17,7 @@ from drivers.can_link import LinkState, NetworkLink
 from drivers.controller import BusErrorClass, ErrorState
 from drivers.errors import BusError
 from drivers.frame import Frame
+from drivers.hardware_stamps import why_no_hardware_stamps
 from drivers.node import Event
 from drivers.ports import Port, interface_is_up, open_port
 from drivers.real_time import run_node
@@ -140,6 +141,23 @@ def test_error_frames_are_counted_and_bus_off_lasts_until_the_restart(port: Sock
     raw.send(RAW.pack(0x083, 0, b""))
     assert next_frame(port)[0] == Frame(0x083)
     assert port.send(SYNC)
+
+
+def test_a_virtual_interface_has_no_clock_of_its_own_and_keeps_the_kernels_stamps(raw: socket.socket) -> None:
+    assert why_no_hardware_stamps("vcan0")
+    port = SocketcanPort("vcan0")
+    try:
+        port.use_hardware_stamps()
+        assert port.receive() is None
+        before_ns = time.monotonic_ns()
+        raw.send(RAW.pack(0x181, 0, b""))
+        after_ns = time.monotonic_ns()
+        time.sleep(0.02)  # else the stamp could not be told from the present
+        frame, at_ns = next_frame(port)
+        assert frame == Frame(0x181)
+        assert before_ns - 1_000_000 <= at_ns <= after_ns + 1_000_000
+    finally:
+        port.close()
 
 
 def test_the_kernel_tells_of_a_virtual_interface_that_it_has_no_controller() -> None:
