@@ -101,6 +101,15 @@ def test_a_controllers_clock_that_is_set_anew_is_followed(step_ns):
     assert bus.worst_of_last(0.5) < 3_000
 
 
+def test_a_stamp_from_the_future_is_believed_at_once_to_be_of_a_clock_set_anew():
+    bus = Bus(0.0).run(1.0)
+    bus.hardware_ns += 30 * MS
+    bus.run(0.05)
+    assert bus.clock.step_count == 1
+    # Late by as little as the best of these frames, no more by what the kernel took for each.
+    assert bus.worst_of_last(0.02) < 5_000
+
+
 def test_a_counter_of_32_bits_of_microseconds_begins_anew_without_a_step():
     bus = Bus(-80e-6, hardware_epoch_ns=WRAP_NS - 5 * SECOND)
     bus.modulus = WRAP_NS

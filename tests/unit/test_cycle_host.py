@@ -202,6 +202,9 @@ def test_isolated_processors_as_the_kernel_lists_them(tmp_path, text, expected):
     assert isolated_processors(tmp_path) == expected
 
 
+STALE = Frame(0x601, b"an answer")
+
+
 class OffLink:
     """An interface whose controller the kernel restarts."""
 
@@ -236,6 +239,7 @@ def test_a_controller_that_is_bus_off_silences_loop_and_kernel_and_stops_the_mac
         if world.core.loop.cycle >= 50 and "off" not in ends:
             ends["off"] = world.now_ns
             controller.take(BusErrorClass.BUS_OFF, b"")
+            world.host._backlog = [STALE]
         elif "off" in ends and "back" not in ends and world.now_ns >= ends["off"] + 20 * MS:
             ends["back"] = world.now_ns
             controller.take(BusErrorClass.RESTARTED, b"")
@@ -253,6 +257,7 @@ def test_a_controller_that_is_bus_off_silences_loop_and_kernel_and_stops_the_mac
     assert flagged == list(range(flagged[0], flagged[-1] + 1))
     syncs = [at_ns for at_ns, frame in world.sent if frame.cob_id == SYNC_COB_ID and at_ns > ends["back"]]
     assert len(syncs) > 100, "the loop sends SYNC itself, whoever sent it before"
+    assert STALE not in [frame for _, frame in world.sent]
     words = {frame.data[0] for at_ns, frame in world.sent if frame.cob_id == 0x201 and at_ns > ends["back"]}
     assert words == {0x02}, "quick stop"
     told = [event for event in world.core.take_events() if isinstance(event, ControllerChanged)]

@@ -25,6 +25,8 @@ pytestmark = [
 RAW = struct.Struct("=IB3x8s")
 CAN_ERR_FLAG = 0x20000000
 PATIENCE_S = 240.0
+SILENCE_S = 60.0
+"""A gateway that has not been heard for so long is not there any more."""
 OUTAGE_S = 1.5
 """Longer than the drives wait for the gateway's heartbeat."""
 SETTLE_S = 0.5
@@ -34,7 +36,7 @@ MOVED_COUNTS = 400
 @pytest.fixture
 def raw() -> Iterator[socket.socket]:
     with socket.socket(29, socket.SOCK_RAW, 1) as opened:
-        opened.settimeout(PATIENCE_S)
+        opened.settimeout(SILENCE_S)
         opened.bind(("vcan0",))
         yield opened
 
@@ -56,8 +58,9 @@ def heard(raw: socket.socket, span_s: float) -> list[int]:
     return cob_ids
 
 
-def wait_for_motion(raw: socket.socket) -> None:
+def wait_for_motion(raw: socket.socket, process: "subprocess.Popen[str]", folder: Path) -> None:
     while True:
+        assert process.poll() is None, (folder / "stderr").read_text()
         cob_id, _, data = RAW.unpack(raw.recv(16))
         if cob_id == 0x201 and abs(int.from_bytes(data[2:6], "little", signed=True)) > MOVED_COUNTS:
             return
@@ -80,7 +83,7 @@ def test_a_run_ends_in_order_whether_the_controller_comes_back_or_not(
     options = ("-i", "socketcan", "-c", "vcan0", "--cycles", "20", "--record", "run.mcap", "--json")
     process = drive_gateway("run", path, *options, folder=tmp_path)
     try:
-        wait_for_motion(raw)
+        wait_for_motion(raw, process, tmp_path)
         error_frame(raw, BusErrorClass.BUS_OFF)
         time.sleep(SETTLE_S)
         with socket.socket(29, socket.SOCK_RAW, 1) as meanwhile:
