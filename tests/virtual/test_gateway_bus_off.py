@@ -1,5 +1,6 @@
 """The gateway's own controller goes bus-off and comes back, or does not: in every phase, for any time and reaction."""
 
+import itertools
 import math
 
 import pytest
@@ -97,28 +98,30 @@ def test_an_outage_of_any_length_in_any_phase_ends_the_run_in_order(phase, for_s
 
 
 @pytest.mark.parametrize(
-    ("reaction", "for_s"),
+    ("reaction", "offset_s"),
     [
-        (Reaction.QUICK_STOP, 0.0300),
-        (Reaction.CONTROLLED_STOP, 0.0109),
+        (Reaction.QUICK_STOP, 0.0),
+        (Reaction.CONTROLLED_STOP, 0.0007),
         *(
-            pytest.param(reaction, for_s, marks=pytest.mark.slow)
+            pytest.param(reaction, n * 1e-4, marks=pytest.mark.slow)
             for reaction in (Reaction.QUICK_STOP, Reaction.CONTROLLED_STOP)
-            for for_s in (0.0100, 0.0102, 0.0104, 0.0106, 0.0108, 0.0306)
+            for n in range(10)
         ),
     ],
 )
-def test_the_first_demand_after_the_return_is_where_the_drives_were_left(reaction, for_s):
+def test_the_first_demand_after_the_return_is_where_the_drives_were_left(reaction, offset_s):
     """No target that the drives see is farther from the one before than the cam makes it in a cycle."""
-    outage = Outage(PHASES["return stroke"], for_s, reacting(reaction))
+    outage = Outage(PHASES["return stroke"] + offset_s, 0.0107, reacting(reaction))
     assert outage.run.stopped_by is StopReason.BUS_OFF
     for node, bound in ((CV, 9), (SERVO, 15)):
         demands = [(at_ns, frame) for at_ns, frame in outage.frames if frame.cob_id == 0x200 + node]
         targets = [int.from_bytes(frame.data[2:6], "little", signed=True) for _, frame in demands]
         last = max(n for n, (at_ns, _) in enumerate(demands) if at_ns <= outage.at_ns + MS)
         assert demands[last + 1][0] > outage.back_ns
-        steps = [abs(two - one) for one, two in zip(targets[last:], targets[last + 1 : last + 4], strict=False)]
-        assert max(steps) <= bound, (node, steps)
+        steps = [abs(two - one) for one, two in itertools.pairwise(targets[last - 3 : last + 4])]
+        # A stop on the cam goes on as it was; one that follows the master has to find it first, for which it has 20 ms.
+        before = max(steps[:3]) + 1 if reaction is Reaction.CONTROLLED_STOP else bound
+        assert max(steps[3:]) <= before, (node, steps)
 
 
 def test_the_outage_is_told_recorded_and_counted():
