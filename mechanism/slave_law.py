@@ -26,6 +26,7 @@ from mechanism.law_proof import (
     finish,
     smooth,
 )
+from mechanism.motion import MasterPlan, plan_stop
 
 FADE_RAD: Final = 0.1
 """Shift at which a feed-forward that knows the cam alone has faded out."""
@@ -55,8 +56,12 @@ class SlaveLaw:
         """rad."""
         self._shift_from: float = 0.0
         self._shift_to: float = 0.0
+        self.shift_velocity: float = 0.0
+        """rad/s; the slave moves so much times the cam's slope by the shift alone."""
         self._shift_s: float = 0.0
         self._shift_left_s: float = 0.0
+        self._halt: MasterPlan | None = None
+        """Of a shift that is being stopped on its way."""
         self._weight: float = 0.0
         """w before the window."""
         self._weight_to: float = 0.0
@@ -121,12 +126,34 @@ class SlaveLaw:
             return
         if self._shift_left_s > 0.0:
             self._shift_left_s = max(self._shift_left_s - period_s, 0.0)
-            share, _ = smooth(1.0 - self._shift_left_s / self._shift_s)
-            self.shift = self._shift_from + share * (self._shift_to - self._shift_from)
+            self.shift, self.shift_velocity, _ = self._shift_at(self._shift_s - self._shift_left_s)
         if theta2 >= self._window[1]:
             self._weight = self._weight_to
             self._window = (inf, inf)
         self.is_plain = self.shift == 0.0 == self._shift_left_s and self._weight == 0.0 == self._weight_to
+
+    @property
+    def is_shifting(self) -> bool:
+        """A phase shift is under way: the slave moves even if the master stands."""
+        return self._shift_left_s > 0.0
+
+    def halt_shift(self) -> None:
+        """Bring a shift under way to rest where it is, within the acceleration and jerk that it has been proved for."""
+        if not self.is_shifting or self._halt is not None:
+            return
+        away, duration_s = abs(self._shift_to - self._shift_from), self._shift_s
+        now = self._shift_at(duration_s - self._shift_left_s)
+        self._halt = plan_stop(*now, 5.774 * away / duration_s**2, 60.0 * away / duration_s**3)
+        self._shift_s = self._shift_left_s = self._halt.duration_s
+
+    def _shift_at(self, t_s: float) -> tuple[float, float, float]:
+        """Shift, its velocity and acceleration (rad, s) since it began, or since it was told to halt."""
+        if self._halt is not None:
+            return self._halt.at(t_s)
+        u, change, duration_s = t_s / self._shift_s, self._shift_to - self._shift_from, self._shift_s
+        share, rate = smooth(u)
+        bend = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u)
+        return self._shift_from + share * change, rate * change / duration_s, bend * change / duration_s**2
 
     def prove_speed(self, speed: float) -> Work[None]:
         """Prove the law in force for a speed of the master (rad/s, either sign) and slower ones.
@@ -138,7 +165,7 @@ class SlaveLaw:
         proof = self._need_proof()
         if self.is_plain and speed > 0.0:
             raise TooFastError(self._cam_speed, self._cam_excess)
-        if self._shift_left_s > 0.0 and speed > 0.0:
+        if self.is_shifting and speed > 0.0:
             raise MotionError("the phase is being shifted, the master may go faster when that is done")
         fastest, excess = yield from proof.fastest(self._pieces(), speed)
         if excess is not None:
@@ -152,7 +179,7 @@ class SlaveLaw:
         Raises MotionError where the shifted path comes too near a singular position or breaks a limit.
         """
         proof = self._need_proof()
-        if self._shift_left_s > 0.0 or self._weight != 0.0 or self._weight_to != 0.0:
+        if self.is_shifting or self._weight != 0.0 or self._weight_to != 0.0:
             raise MotionError("the phase can be shifted when the slave is on its cam and no other shift is under way")
         away = abs(shift - self.shift)
         if away == 0.0:
@@ -177,6 +204,7 @@ class SlaveLaw:
         self._proved_speed = speed
         self._shift_from, self._shift_to = self.shift, shift
         self._shift_s = self._shift_left_s = duration_s
+        self._halt = None
         self.is_plain = False
 
     def prove_engagement(self, is_engaged: bool, at: float, window: float, speed: float) -> "Work[Engagement]":
@@ -228,7 +256,7 @@ class SlaveLaw:
             raise MotionError(f"the slave is {'on its cam' if is_engaged else 'off its cam'} already")
         if self._window[1] != inf:
             raise MotionError("the slave is still on its way, it can be sent back when it has arrived")
-        if self._shift_left_s > 0.0:
+        if self.is_shifting:
             raise MotionError("the phase is being shifted, the slave can leave its cam when that is done")
 
     def _engagement(self, is_engaged: bool, start: float, width: float) -> LawState:

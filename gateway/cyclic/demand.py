@@ -136,7 +136,7 @@ class CamDemand:
     def is_finished(self) -> bool:
         """Whether the plan has been followed to its end."""
         is_over = self._plan is not None and self._step * self._period_s >= self._plan.duration_s
-        return is_over and not self.is_paused
+        return is_over and not self.is_paused and not self.law.is_shifting
 
     def align(self, master_position: float, actuals: tuple[int, int]) -> tuple[int, int]:
         """Counts of both axes with the master at this theta2: where they must stand before a plan begins there.
@@ -164,7 +164,7 @@ class CamDemand:
         theta5, slope, plainness = self.law.step(position, self._period_s)
         self.master_position = position
         self.master_velocity = velocity
-        self.velocities = [velocity, slope * velocity]
+        self.velocities = [velocity, slope * (velocity + self.law.shift_velocity)]
         master_turns, slave_turns = self._turns
         self.targets = [
             wrap_counts(self._units[MASTER].counts(position) + master_turns),
@@ -180,6 +180,9 @@ class CamDemand:
         if self._torques is not None:
             self.torque_offsets = self._torques.at(position, velocity, self._acceleration, (1.0 - share) * plainness)
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
+        if phase is Phase.STANDSTILL and self.law.is_shifting:
+            # The slave moves even so, and is to be guarded.
+            phase = Phase.RAMP_UP
         self.phase = phase
         if self._is_stopping and phase is not Phase.STANDSTILL:
             self.phase = Phase.CONTROLLED_STOP
@@ -218,4 +221,5 @@ class CamDemand:
         self.is_paused = False
         plan = plan_stop(self.master_position, self.master_velocity, self._acceleration, *self._limits)
         self._follow(plan)
+        self.law.halt_shift()
         self._is_stopping = True

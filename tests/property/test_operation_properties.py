@@ -12,6 +12,7 @@ from config.loading import load_config, parse_config
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.operation import Operation, Order
 from gateway.cyclic.torque_offsets import build_feed_forward
+from gateway.record.sample import Phase
 from gateway.running.drive_settings import axis_units
 from gateway.running.operation_setup import operation_limits, slave_law
 from gateway.running.preparation import compile_config, plan
@@ -272,6 +273,40 @@ def test_a_shift_of_any_size_keeps_the_limits(shift, percent):
     for degrees in (shift, 0.0):
         refusal = machine.order(Order.PHASE_SHIFT, degrees)
         assert refusal == "" or refusal.startswith("shifted to ")
-        machine.until(lambda: machine.law._shift_left_s == 0.0)
+        machine.until(lambda: not machine.law.is_shifting)
     assert machine.law.is_plain
     machine.assert_limits_were_kept()
+
+
+@settings(deadline=None, derandomize=True, max_examples=8)
+@given(st.floats(-6.0, 6.0).filter(lambda shift: abs(shift) > 0.1), st.floats(0.0, 1.5), st.booleans())
+def test_a_stop_while_the_phase_is_shifted_brings_both_axes_to_rest_within_their_limits(shift, after, is_waiting):
+    machine = Operated().to_speed()
+    if is_waiting:
+        machine.order(Order.OVERRIDE, 0.0)
+        machine.until(lambda: machine.demand.master_velocity == 0.0)
+    assert machine.order(Order.PHASE_SHIFT, shift) == ""
+    machine.go(after)
+    machine.demand.controlled_stop()
+    machine.until(lambda: machine.demand.is_finished, 3.0)
+    assert not machine.law.is_shifting
+    machine.go(0.01)
+    machine.assert_limits_were_kept()
+    assert np.ptp(np.array(machine.angles[-8:]), axis=0) == pytest.approx(0.0, abs=1e-12)
+    assert 0.0 <= machine.law.shift / math.radians(shift) <= 1.0 + 1e-9
+
+
+def test_a_shift_of_a_machine_that_waits_is_shown_and_guarded_as_motion():
+    machine = Operated().to_speed()
+    machine.order(Order.OVERRIDE, 0.0)
+    machine.until(lambda: machine.demand.phase is Phase.STANDSTILL)
+    assert machine.order(Order.PHASE_SHIFT, 3.0) == ""
+    machine.go(0.25)
+    assert machine.demand.phase is Phase.RAMP_UP
+    before, after = machine.angles[-2][1], machine.angles[-1][1]
+    assert machine.demand.velocities[1] == pytest.approx((after - before) / PERIOD_S, rel=0.02)
+    assert machine.demand.velocities[0] == 0.0
+    machine.until(lambda: not machine.law.is_shifting)
+    machine.go(0.01)
+    assert machine.demand.phase is Phase.STANDSTILL
+    assert machine.law.shift == pytest.approx(math.radians(3.0))
