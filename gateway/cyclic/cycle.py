@@ -572,7 +572,9 @@ class CyclicLoop:
         if self.late_listener is not None:
             tpdo_ns = None if self._flags & MISSED_TPDO_MASK else self._arrival_ns
             deviation_ns = self._sync_deviation_ns
-            late = Late(kind, self.cycle, sync_ns, deadline_ns, sent_ns, self.is_paced, deviation_ns, tpdo_ns)
+            late = Late(
+                kind, self.cycle, sync_ns, deadline_ns, sent_ns, self.is_paced, deviation_ns, tpdo_ns, self._is_lost
+            )
             self.late_listener.missed(late)
 
     def _account(self, deadline_ns: int) -> None:

@@ -34,6 +34,8 @@ class Late:
     """SYNC(k) against its ideal instant."""
     tpdo_ns: int | None
     """Last TPDO after SYNC(k); None where one is missing."""
+    is_lost: bool = False
+    """The demand never was on the bus: the controller was bus-off."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,7 +42,7 @@ class Cause(Enum):
     DRIVES_LATE = "drives_late"
     """The loop was awake in time, and the TPDOs were not there."""
     BUS_FULL = "bus_full"
-    """The bus did not take the demand at once."""
+    """The bus did not take the demand at once, or not at all: the own controller was bus-off."""
     PAGE_FAULT = "page_fault"
     """The loop waited for a page of its memory."""
     OWN_CALL = "own_call"

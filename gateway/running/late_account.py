@@ -243,6 +243,10 @@ class LateAccountant:
             by_ns = max(1, (late.sent_ns or 0) - late.deadline_ns)
             self._count(Explanation(late.kind, late.cycle, late.deadline_ns, by_ns, ((Cause.SYNC_IRREGULAR, by_ns),)))
             return
+        if late.is_lost:
+            shares = ((Cause.BUS_FULL, self._period_ns),)
+            self._count(Explanation(late.kind, late.cycle, late.deadline_ns, self._period_ns, shares))
+            return
         if len(self._pending) >= MAX_PENDING:
             self._look(self._clock(), -1)
         is_earlier = late.is_paced and late.sent_ns is not None and self._closed_cycle == late.cycle

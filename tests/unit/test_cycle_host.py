@@ -17,6 +17,7 @@ from drivers.real_time import isolated_processors
 from drivers.socketcan_port import SocketcanPort
 from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
+from gateway.record.lateness import Cause
 from gateway.record.sample import SampleFlag
 from gateway.running import cycle_bus
 from gateway.running.assembly import build_core
@@ -24,6 +25,7 @@ from gateway.running.bus_address import BusAddress
 from gateway.running.controller_watch import ControllerWatch
 from gateway.running.cycle_bus import open_cycle_bus
 from gateway.running.cycle_host import CycleHost
+from gateway.running.late_account import LateAccountant
 from gateway.running.preparation import prepare
 
 MS = 1_000_000
@@ -231,6 +233,8 @@ def test_a_controller_that_is_bus_off_silences_loop_and_kernel_and_stops_the_mac
         clock=lambda: world.now_ns,
         sleep=world.sleep,
     )
+    accountant = LateAccountant(MS, lambda *_: None, is_fine=False, clock=lambda: world.now_ns)
+    world.core.loop.late_listener = accountant
     ends = {}
     drained = world.receive
 
@@ -255,6 +259,10 @@ def test_a_controller_that_is_bus_off_silences_loop_and_kernel_and_stops_the_mac
     flagged = [n for n, flags in enumerate(world.samples.flags) if flags & SampleFlag.SEND_BUFFER_FULL]
     assert 19 <= len(flagged) <= 21
     assert flagged == list(range(flagged[0], flagged[-1] + 1))
+    missed = sum(bool(flags & SampleFlag.MISSED_RPDO_DEADLINE) for flags in world.samples.flags)
+    account = accountant.account
+    assert (account.missed, account.counts, account.not_explained) == (missed, {Cause.BUS_FULL: missed}, 0)
+    assert missed >= 19
     syncs = [at_ns for at_ns, frame in world.sent if frame.cob_id == SYNC_COB_ID and at_ns > ends["back"]]
     assert len(syncs) > 100, "the loop sends SYNC itself, whoever sent it before"
     assert STALE not in [frame for _, frame in world.sent]
