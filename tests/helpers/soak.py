@@ -23,7 +23,7 @@ from typing import Any
 from soak_account import LeakWatch, Tally, as_json, table
 from soak_judge import Judge
 from soak_scenario import draw_campaign, gateway_texts
-from soak_session import Rig, Session, prepared_run
+from soak_session import Rig, Session, proved_law
 
 NOTE_S = 60.0
 WARM_UP = 6
@@ -79,7 +79,7 @@ def soak(hours: float, first_seed: int, stride: int, say: Any = None, is_stoppin
     if hours >= 1.0:
         # So that what is kept for good is there before anything is counted.
         for text in gateway_texts():
-            prepared_run(text)
+            proved_law(text)
     noted_s, since_s = time.monotonic(), time.process_time()
     while tally.guarded_s < hours * 3600.0 and not is_stopping():
         run_campaign(seed, tally)

@@ -3,10 +3,12 @@
 import heapq
 import math
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from random import Random
 from typing import Any
+from unittest import mock
 
 from soak_scenario import ORDER_OF, PAPER, WISH_OF, Campaign, Mischief, Moment, Provocation, SessionPlan
 
@@ -18,12 +20,15 @@ from drivers.frame import Frame
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
 from gateway.record.sample import Phase
-from gateway.running.assembly import build_core
+from gateway.running import assembly
 from gateway.running.core import GatewayCore
 from gateway.running.machine_session import StepReached
+from gateway.running.operation_setup import slave_law
 from gateway.running.preparation import PreparedRun, prepare
 from gateway.running.preparation import plan as plan_of_run
 from gateway.running.recovery import AxisRecovered
+from mechanism.cam_profile import CamProfile
+from mechanism.slave_law import SlaveLaw
 from sim_drive.assembly import build_machine
 from sim_drive.injection.faults import Fault
 from sim_drive.injection.injector import Injector
@@ -54,6 +59,17 @@ MOMENT_OF_STEP = {"enabling the axes": Moment.ENABLING, "recovering the axes": M
 def prepared_run(text: str) -> PreparedRun:
     """A gateway's run of one machine cycle; there are few configurations, and they come back."""
     return prepare(parse_config(text, PAPER.path), 1)
+
+
+@lru_cache(maxsize=64)
+def proved_law(text: str) -> SlaveLaw:
+    """The law of a gateway's configuration, the cam proved."""
+    return slave_law(parse_config(text, PAPER.path), prepared_run(text).cam.profile)
+
+
+def law_of_run(config: GatewayConfig, profile: CamProfile) -> SlaveLaw:
+    """A law as it is before any order; proving the cam for each session anew would be a fifth of a soak."""
+    return copy(proved_law(config.text))
 
 
 class WatchedPlant:
@@ -189,14 +205,15 @@ class Rig:
         prepared = prepared_run(self.config.text)
         prepared = replace(prepared, plan=plan_of_run(self.config, plan.machine_cycles))
         session = Session(plan, prepared, self.now_ns, 0, self.is_ready, None)  # type: ignore[arg-type]
-        session.core = core = build_core(
-            self.config,
-            prepared.cam.profile,
-            prepared.plan,
-            session,
-            is_homing_again=self.is_homing_again,
-            approach_cycles=plan.machine_cycles,
-        )
+        with mock.patch.object(assembly, "slave_law", law_of_run):
+            session.core = core = assembly.build_core(
+                self.config,
+                prepared.cam.profile,
+                prepared.plan,
+                session,
+                is_homing_again=self.is_homing_again,
+                approach_cycles=plan.machine_cycles,
+            )
         host = HostedCore(core)
         planned = {p.what for p in plan.provocations if isinstance(p.what, Mischief)}
         node: Any = host if planned & {Mischief.HOST_AWAY, Mischief.HOST_LATE} else core
