@@ -68,10 +68,9 @@ class VirtualBus:
     """
 
     __slots__ = (
-        "_busy_ns",
         "_earliest_wake_ns",
+        "_ended",
         "_faults",
-        "_frame_count",
         "_frame_end_ns",
         "_late",
         "_late_count",
@@ -120,8 +119,8 @@ class VirtualBus:
         self._source = random.Random(seed)  # noqa: S311 - reproducible on purpose
         self._on_event = on_event
         self._now_ns = start_ns
-        self._busy_ns = 0
-        self._frame_count = 0
+        self._ended = [0] * len(WORST_CASE_BITS)
+        """Frames that have ended on the wire, by their bytes of data."""
         self._wakes: list[int] = [_NEVER] * (len(self.nodes) + 1)
         """When each node wants to be woken; the last entry stands there for a bus without nodes."""
         self._earliest_wake_ns = _NEVER
@@ -135,7 +134,7 @@ class VirtualBus:
         # Bound methods looked up once: delivering a frame is most of what a run does.
         self._listeners: Final = tuple(
             tuple(
-                (index, node.receive, node.take_frames, node.next_wake_ns, node.take_events, self._queues[index])
+                (node.receive, (index, node.take_frames, node.next_wake_ns, node.take_events, self._queues[index]))
                 for index, node in enumerate(self.nodes)
                 if index != sender
             )
@@ -151,12 +150,12 @@ class VirtualBus:
     @property
     def busy_ns(self) -> int:
         """Time the bus has spent on frames that have ended; over the elapsed time it is the bus load."""
-        return self._busy_ns
+        return sum(count * wire_ns for count, wire_ns in zip(self._ended, self._wire_ns, strict=True))
 
     @property
     def frame_count(self) -> int:
         """Frames that have ended on the wire, lost ones included."""
-        return self._frame_count
+        return sum(self._ended)
 
     def refresh(self) -> None:
         """Ask every node for its frames, events and next wake, after something outside the bus has changed one."""
@@ -193,8 +192,10 @@ class VirtualBus:
         wire_ns = self._wire_ns
         now_ns = self._now_ns
         sender = self._sender
+        ended = self._ended
+        deliver = self._deliver if self._faults is None else self._deliver_at_fault
         frame = self._on_wire
-        frame_ns = 0 if frame is None else wire_ns[len(frame.data)]
+        length = 0 if frame is None else len(frame.data)
         frame_end_ns = self._frame_end_ns
         if frame is None and any(self._queues):
             # The wire is free and frames wait: as if a frame ended now, so that the first instant arbitrates.
@@ -202,26 +203,21 @@ class VirtualBus:
         try:
             while condition is None or condition():
                 next_ns = self._earliest_wake_ns
-                is_frame_ending = frame_end_ns <= next_ns
-                if is_frame_ending:
+                if frame_end_ns < next_ns:
                     next_ns = frame_end_ns
                 if late and late[0][0] < next_ns:
                     next_ns = late[0][0]
-                    is_frame_ending = False
                 if next_ns > limit_ns:
                     self._now_ns = limit_ns
                     return False
                 if next_ns > now_ns:
                     self._now_ns = now_ns = next_ns
-                if is_frame_ending:
-                    ended, frame, frame_end_ns = frame, None, _NEVER
-                    if ended is not None:
-                        self._busy_ns += frame_ns
-                        self._frame_count += 1
-                        if self._faults is None:
-                            self._deliver(sender, ended, now_ns)
-                        else:
-                            self._deliver_at_fault(self._faults, sender, ended, now_ns)
+                if frame_end_ns == next_ns:
+                    frame_end_ns = _NEVER
+                    if frame is not None:
+                        heard, frame = frame, None
+                        ended[length] += 1
+                        deliver(sender, heard, now_ns)
                 if late:
                     self._deliver_late(now_ns)
                 if self._earliest_wake_ns <= now_ns:
@@ -239,17 +235,18 @@ class VirtualBus:
                     if best != _NEVER:
                         frame = self._queues[sender].popleft()
                         _, data, _ = frame
-                        frame_ns = wire_ns[len(data)]
-                        frame_end_ns = now_ns + frame_ns
+                        length = len(data)
+                        frame_end_ns = now_ns + wire_ns[length]
         finally:
             self._sender = sender
             self._on_wire = frame
             self._frame_end_ns = frame_end_ns
         return True
 
-    def _deliver_at_fault(self, faults: BusFaults, sender: int, frame: Frame, now_ns: int) -> None:
+    def _deliver_at_fault(self, sender: int, frame: Frame, now_ns: int) -> None:
         """Do with a frame that has left the wire what the faults say."""
-        for delay_ns in faults.delays_ns(sender, frame, now_ns, self._source):
+        delays_ns = (0,) if self._faults is None else self._faults.delays_ns(sender, frame, now_ns, self._source)
+        for delay_ns in delays_ns:
             if delay_ns <= 0:
                 self._deliver(sender, frame, now_ns)
             else:
@@ -266,9 +263,10 @@ class VirtualBus:
             self._trace(now_ns, frame)
         wakes = self._wakes
         on_event = self._on_event
-        for index, receive, take_frames, next_wake_ns, take_events, queue in self._listeners[sender]:
+        for receive, questions in self._listeners[sender]:
             if receive(frame, now_ns) is False:
                 continue
+            index, take_frames, next_wake_ns, take_events, queue = questions
             frames = take_frames()
             if frames:
                 queue.extend(frames)

@@ -316,11 +316,11 @@ class EmulatedMachine:
         if plant.torn_at_s is not None and not self._has_tripped:
             self._trip_all(plant.torn_at_s, now_ns)
         is_quiet = True
-        angle = plant.angle
+        angles = plant.angles
         for station in self._stations:
             for motor in station.motors:
                 index = motor.index
-                self._torques[index] = motor.run(now_ns, angle(index))
+                self._torques[index] = motor.run(now_ns, angles[index])
                 self._brakes[index] = motor.is_braked
             drive = station.drive
             if drive.watches_events:

@@ -176,6 +176,11 @@ class FreeAxisPlant:
         """Always None: there is no linkage to tear."""
         return None
 
+    @property
+    def angles(self) -> Sequence[float]:
+        """Angles in rad at the end of the last servo period."""
+        return self._angles
+
     def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
         """One servo period (1/1024 s) under constant torque commands (N m), one of each an axis."""
         self._steps += 1

@@ -61,6 +61,11 @@ class Plant(Protocol):
         """Plant time at which the linkage tore, None while it is whole."""
         ...
 
+    @property
+    def angles(self) -> Sequence[float]:
+        """Angles in rad at the end of the last servo period."""
+        ...
+
     def advance(self, torque_commands_Nm: Sequence[float], brakes_engaged: Sequence[bool]) -> None:
         """One servo period (1/1024 s) under constant torque commands (N m), one of each an axis."""
         ...
@@ -133,6 +138,11 @@ class FiveBarPlant:
     def time_s(self) -> float:
         """Plant time: servo periods advanced so far, in seconds."""
         return self._steps * SERVO_PERIOD_S
+
+    @property
+    def angles(self) -> Sequence[float]:
+        """theta2 and theta5 in rad at the end of the last servo period."""
+        return self._values[:2]
 
     @property
     def state(self) -> AxisState:
