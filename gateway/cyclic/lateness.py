@@ -42,8 +42,6 @@ class Late:
 class Spell:
     """One spell of the loop being awake, and the sleep before it; spans in ns."""
 
-    has_rested: bool
-    """There was a sleep before it; else it is the later part of a spell that did not end."""
     planned_ns: int
     """When it was to wake."""
     woke_ns: int
@@ -72,7 +70,9 @@ class Evidence:
     off_ns: int = 0
     """Not running since the planned wake."""
     own_excess_ns: int = 0
-    """Own processor time beyond the own share of the cycle."""
+    """Own processor time beyond the own share of one cycle."""
+    own_overload_ns: int = 0
+    """Own processor time beyond the own share of all cycles that the spell has lasted: too much for any machine."""
     late_wake_ns: int = 0
     """Of ``off_ns``, what had passed when the loop woke, and not been spent on waiting for a processor."""
     ready_ns: int = 0
@@ -117,6 +117,7 @@ def _own_call(seen: Evidence) -> int:
 
 
 TABLE: Final[tuple[tuple[Cause, Callable[[Evidence], int]], ...]] = (
+    (Cause.OWN_WORK, lambda seen: seen.own_overload_ns),
     (Cause.ANOTHER_PROCESS, lambda seen: min(seen.ready_ns, seen.off_ns)),
     (Cause.SYNC_IRREGULAR, lambda seen: seen.sync_ns),
     (Cause.DRIVES_LATE, lambda seen: seen.drives_ns),
@@ -126,9 +127,12 @@ TABLE: Final[tuple[tuple[Cause, Callable[[Evidence], int]], ...]] = (
     (Cause.STOOD_STILL, _stood_still),
     (Cause.PAGE_FAULT, _page_fault),
     (Cause.OWN_CALL, _own_call),
-    (Cause.OWN_WORK, lambda seen: seen.own_excess_ns),
+    (Cause.OWN_WORK, lambda seen: seen.own_excess_ns - seen.own_overload_ns),
 )
-"""What each cause covers of the lateness, asked in this order; what none of them covers is not explained."""
+"""What each cause covers of the lateness, asked in this order; what none of them covers is not explained.
+
+A loop that is never done in time is asked for its own work first: what once took its time would explain all the rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,17 +156,17 @@ def explain(
     """
     missed_by_ns = max(1, sent_ns - late.deadline_ns)
     left_ns = missed_by_ns
-    shares: list[tuple[Cause, int]] = []
+    shares: dict[Cause, int] = {}
     seen = evidence(late, sent_ns, spell, cycle)
     found = dict(carried)
     for cause, test in TABLE:
-        covered_ns = min(left_ns, test(seen) + found.get(cause, 0))
+        covered_ns = min(left_ns, test(seen) + found.pop(cause, 0))
         if covered_ns > 0:
-            shares.append((cause, covered_ns))
+            shares[cause] = shares.get(cause, 0) + covered_ns
             left_ns -= covered_ns
     if left_ns:
-        shares.append((Cause.NOT_EXPLAINED, left_ns))
-    return Explanation(late.kind, late.cycle, late.deadline_ns, missed_by_ns, tuple(shares))
+        shares[Cause.NOT_EXPLAINED] = left_ns
+    return Explanation(late.kind, late.cycle, late.deadline_ns, missed_by_ns, tuple(shares.items()))
 
 
 def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -> Evidence:
@@ -184,15 +188,18 @@ def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -
     if spell.ready_ns is None:
         # All that is certain without the kernel's counters: asleep it did not work.
         off_ns = min(off_ns, late_wake_ns)
+    share_ns = period_ns - phase_ns
+    cycles = -(-elapsed_ns // period_ns)
     # Later in its cycle than the phase, because SYNC was early, or because TPDOs were waited for.
-    waited_ns = max(0, spell.planned_ns - late.sync_ns - phase_ns) if spell.has_rested else 0
+    waited_ns = max(0, spell.planned_ns - late.sync_ns - phase_ns)
     early_ns = min(waited_ns, before_ns)
     drives_ns = waited_ns - early_ns
     if late.tpdo_ns is not None:
         drives_ns = min(drives_ns, max(0, late.tpdo_ns - late.sync_ns - phase_ns))
     return Evidence(
         off_ns=off_ns,
-        own_excess_ns=0 if spell.processor_ns is None else max(0, own_ns - (period_ns - phase_ns)),
+        own_excess_ns=0 if spell.processor_ns is None else max(0, own_ns - share_ns),
+        own_overload_ns=0 if spell.processor_ns is None else max(0, own_ns - share_ns * max(1, cycles)),
         late_wake_ns=min(off_ns, max(0, late_wake_ns - spell.ready_at_wake_ns)),
         ready_ns=spell.ready_ns or 0,
         extra_switches=spell.extra_switches,

@@ -28,10 +28,8 @@ from gateway.running.wake_trace import WakeTrace
 
 LONG_SHARE: Final = 0.25
 """A spell of so large a part of the cycle is looked at."""
-LONGEST_SPELL: Final = 4
-"""After so many cycles without rest a spell is closed, lest what happened in its beginning explain all that follows."""
-NO_REST_NS: Final = 15_000
-"""A wait that ends within this did not wait."""
+NO_REST_SHARE: Final = 0.03
+"""A wait that ends within this part of the cycle was none."""
 COARSE_NS: Final = 50_000
 """A processor clock that goes in steps larger than this cannot tell who had a part of a cycle."""
 TELL_EVERY_NS: Final = 1_000_000_000
@@ -40,8 +38,6 @@ MAX_TOLD: Final = 1000
 """Late demands told one by one in a run."""
 MAX_PENDING: Final = 64
 _MAX_QUEUED: Final = 64
-_NO_REST: Final = -1
-"""In place of the number of waits for the bus: the spell began without a wake, which would have been a switch too."""
 _STAT_BYTES: Final = 96
 
 Tell = Callable[[int, str, str, dict[str, str | int | bool]], None]
@@ -214,7 +210,7 @@ class LateAccountant:
 
     def roused(self, woke_ns: int) -> None:
         """See ``gateway.running.cycle_host.LateWatch``."""
-        if self._before_wait is not None and woke_ns - self._rest_ns < NO_REST_NS:
+        if self._before_wait is not None and self._has_not_waited(woke_ns - self._rest_ns):
             (
                 self._rest_ns, self._planned_ns, self._woke_ns, self._stale_ns, self._ready_at_wake_ns, self._bus_ns,
                 self._refusals, self._counters_before, self._processor_before_ns,
@@ -275,9 +271,9 @@ class LateAccountant:
         if not self._is_news and self._trace is None and not self._pending:
             return
         now_ns = self._clock()
-        if self._pending and now_ns - self._planned_ns > LONGEST_SPELL * self._period_ns:
+        if self._pending and now_ns - self._told_ns >= TELL_EVERY_NS:
+            # A loop that is always late never rests, and is told of all the same.
             self._look(now_ns, -1)
-            self._begin_anew(now_ns)
         if self._is_news and now_ns - self._told_ns >= TELL_EVERY_NS:
             self._tell_account(now_ns)
         elif self._queue and now_ns - self._demand_told_ns >= TELL_DEMAND_EVERY_NS:
@@ -297,15 +293,14 @@ class LateAccountant:
         if self._trace is not None:
             self._trace.flush()
 
-    def _begin_anew(self, now_ns: int) -> None:
-        """A spell begins without a rest before it."""
-        self._rest_ns = self._planned_ns = self._woke_ns = now_ns
-        self._stale_ns = self._ready_at_wake_ns = self._bus_ns = 0
-        self._refusals = _NO_REST
+    def _has_not_waited(self, span_ns: int) -> bool:
+        """Whether what the loop had asked for was there at once, whoever took the processor meanwhile."""
         if self._counters is not None:
-            self._counters_before = self._counters()
-        if self._is_fine:
-            self._processor_before_ns = self._processor_ns()
+            before, now = self._counters_before.split(), self._counters().split()
+            if now[2] == before[2]:
+                return True
+            span_ns -= int(now[1]) - int(before[1])
+        return span_ns < NO_REST_SHARE * self._period_ns
 
     def _ready_so_far_ns(self) -> int:
         """Ready without a processor since the last rest began."""
@@ -325,7 +320,6 @@ class LateAccountant:
         faults = self._faults()
         stood_still_ns = 0 if self._witness is None else self._witness.stood_still_ns(self._planned_ns, now_ns)
         spell = Spell(
-            has_rested=self._refusals >= 0,
             planned_ns=self._planned_ns,
             woke_ns=self._woke_ns,
             end_ns=now_ns,
