@@ -573,7 +573,16 @@ class CyclicLoop:
             tpdo_ns = None if self._flags & MISSED_TPDO_MASK else self._arrival_ns
             deviation_ns = self._sync_deviation_ns
             late = Late(
-                kind, self.cycle, sync_ns, deadline_ns, sent_ns, self.is_paced, deviation_ns, tpdo_ns, self._is_lost
+                kind,
+                self.cycle,
+                sync_ns,
+                deadline_ns,
+                sent_ns,
+                self.is_paced,
+                deviation_ns,
+                tpdo_ns,
+                is_lost=self._is_lost,
+                own_ns=self._cpu_ns,
             )
             self.late_listener.missed(late)
 

@@ -36,6 +36,8 @@ class Late:
     """Last TPDO after SYNC(k); None where one is missing."""
     is_lost: bool = False
     """The demand never was on the bus: the controller was bus-off."""
+    own_ns: int = 0
+    """Processor time of the loop from account to account, so for this cycle; 0 where nobody measures it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +74,7 @@ class Evidence:
     own_excess_ns: int = 0
     """Own processor time beyond the own share of one cycle."""
     own_overload_ns: int = 0
-    """Own processor time beyond the own share of all cycles that the spell has lasted: too much for any machine."""
+    """Own processor time beyond the own share of this very cycle, or of all of the spell's together."""
     late_wake_ns: int = 0
     """Of ``off_ns``, what had passed when the loop woke, and not been spent on waiting for a processor."""
     ready_ns: int = 0
@@ -127,11 +129,11 @@ TABLE: Final[tuple[tuple[Cause, Callable[[Evidence], int]], ...]] = (
     (Cause.STOOD_STILL, _stood_still),
     (Cause.PAGE_FAULT, _page_fault),
     (Cause.OWN_CALL, _own_call),
-    (Cause.OWN_WORK, lambda seen: seen.own_excess_ns - seen.own_overload_ns),
+    (Cause.OWN_WORK, lambda seen: max(0, seen.own_excess_ns - seen.own_overload_ns)),
 )
 """What each cause covers of the lateness, asked in this order; what none of them covers is not explained.
 
-A loop that is never done in time is asked for its own work first: what once took its time would explain all the rest.
+A loop that does too much is asked for its own work first: what once took its time would explain all the rest.
 """
 
 
@@ -199,7 +201,9 @@ def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -
     return Evidence(
         off_ns=off_ns,
         own_excess_ns=0 if spell.processor_ns is None else max(0, own_ns - share_ns),
-        own_overload_ns=0 if spell.processor_ns is None else max(0, own_ns - share_ns * max(1, cycles)),
+        own_overload_ns=0
+        if spell.processor_ns is None
+        else max(0, own_ns - share_ns * max(1, cycles), late.own_ns - share_ns),
         late_wake_ns=min(off_ns, max(0, late_wake_ns - spell.ready_at_wake_ns)),
         ready_ns=spell.ready_ns or 0,
         extra_switches=spell.extra_switches,

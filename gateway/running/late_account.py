@@ -351,9 +351,11 @@ class LateAccountant:
 
     def _why_sync_was_late(self, late: Late, spell: Spell) -> Shares:
         """Causes, none of them the loop's, of which the loop's own SYNC was late."""
-        if late.deviation_ns <= 0:
+        # A SYNC that is whole cycles late leaves as much of its own cycle as if it were late by the rest alone.
+        short_ns = self._period_ns - (late.deadline_ns - late.sync_ns)
+        if short_ns <= 0:
             return ()
-        due_ns = late.sync_ns - late.deviation_ns
+        due_ns = late.sync_ns - short_ns
         own_sync = Late(LateKind.OVERRUN, late.cycle, due_ns, due_ns, late.sync_ns, False, 0, None)
         told = explain(own_sync, late.sync_ns, spell, CycleShape(self._period_ns, 0, late.sync_ns))
         return tuple((cause, span_ns) for cause, span_ns in told.shares_ns if cause in OUTSIDE)

@@ -142,6 +142,16 @@ def test_a_demand_sent_in_time_is_late_only_by_bus_and_sync():
     assert told(None, 1100, handed_us=1100).cause is Cause.NOT_EXPLAINED
 
 
+def test_work_beyond_the_share_of_this_very_cycle_is_not_covered_by_what_was_taken_before():
+    """3 ms were taken; catching up, the loop worked for 0.9 ms in this cycle, and for 0.2 ms in all others."""
+    taken = spell(4100, processor_us=1100, ready_us=3000, extra_switches=1)
+    late = replace(LATE, sync_ns=2500 * US, deadline_ns=3500 * US, tpdo_ns=2750 * US)
+    assert told(taken, 4100, replace(late, own_ns=200 * US)).is_explained
+    found = told(taken, 4100, replace(late, own_ns=900 * US))
+    assert found.shares_ns == ((Cause.OWN_WORK, 200 * US), (Cause.ANOTHER_PROCESS, 400 * US))
+    assert not found.is_explained
+
+
 def test_a_loop_that_is_never_done_in_time_has_itself_to_blame():
     """9 ms of work in 12 ms, 8.4 ms of which are its share; or 8 ms: then the 3 ms that were taken are the cause."""
     sooner = replace(LATE, deadline_ns=11800 * US)
