@@ -41,5 +41,9 @@ class Quirk(Enum):
     LATE_SYNC_FREEZES = "late_sync_freezes"
     """In cyclic modes, with 1006h set, a SYNC that is more than 0.5 ms late freezes the axis where its demand is, and
     sets statusword bit 15, until the next SYNC (isel IMD20)."""
+    NO_ABORT_OPTION = "no_abort_option"
+    """6007h is not there, which the standard allows: the loss of the master is told by EMCY, and nothing follows."""
+    ABORT_OPTION_STAYS = "abort_option_stays"
+    """6007h takes any value without a word, reads as 0, and so does nothing (objects for show)."""
     TORQUE_OFFSET_NOT_MAPPABLE = "torque_offset_not_mappable"
     """60B2h is there, but no PDO takes it (06040041h)."""

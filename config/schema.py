@@ -12,6 +12,7 @@ from config.emulation_section import EmulatedDriveSection
 from config.guard_section import GuardSection
 from config.model import AxisName, Model, Point, Positive
 from config.torque_sections import FeedForwardSection, LearningSection, PositionLoopSection
+from config.watchdog_section import SyncWatchdogSection
 from drivers.nmt import MAX_NODE_ID
 
 SERVO_RATE_HZ: Final = 1024
@@ -165,6 +166,8 @@ class AxisSection(Model):
     limits: LimitsSection
     position_loop: PositionLoopSection | None = None
     """Null: the drive closes the loop (csp); else the gateway does (cst)."""
+    sync_watchdog: SyncWatchdogSection | None = None
+    """Null: the drive's watch over SYNC, if it has one, is left as it is."""
     emulation: EmulatedDriveSection
 
 
@@ -243,8 +246,8 @@ class EmulatorSection(Model):
 
     eds: str = "eds/sim_drive.eds"
     sub_steps: Annotated[int, Field(ge=1, le=100)] = 4
-    missing_sync_limit: Annotated[int, Field(ge=1, le=1000)] = 20
-    """SYNC periods without a SYNC after which an enabled drive faults."""
+    missing_sync_limit: Annotated[int, Field(ge=0, le=1000)] = 0
+    """Set-point watchdog 3050h of a drive as it is switched on; 0: off, as ``axes.*.sync_watchdog`` finds it."""
 
 
 class GatewayConfig(Model):
@@ -379,6 +382,8 @@ class GatewayConfig(Model):
     def _guard_can_trip(self) -> Self:
         self.guard.check_cycle(self.bus.cycle_us, self.bus.heartbeat_timeout_ms)
         for name, axis in self.axes.items():
+            if axis.sync_watchdog is not None:
+                axis.sync_watchdog.check(name, self.bus.cycle_us, self.guard.sync_lost.limit_cycles)
             self.guard.check_axis(name, axis.counts_per_revolution, axis.limits.following_error_counts)
             links = self.machine.five_bar
             self.guard.check_end_effector(links.p_mm + links.q_mm, axis.counts_per_revolution)

@@ -91,6 +91,8 @@ loss."""
 TIME_OF_DAY: Final = 0x3030
 """Record, read only: what the TIME messages have told; UNSIGNED32 milliseconds after midnight, UNSIGNED16 days since
 1984-01-01."""
+SET_POINT_WATCHDOG: Final = 0x3050
+"""UNSIGNED16: interpolation times 60C2h without a set-point after which an enabled axis faults (8700h); 0 for none."""
 
 # The areas of the object dictionary (CiA 301, table 40)
 COMMUNICATION_PROFILE_AREA: Final = range(0x1000, 0x2000)

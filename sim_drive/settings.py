@@ -31,7 +31,8 @@ class DriveSettings:
     initial_offset_counts: int = 0
     """Position actual value minus shaft counts after power-on, before any homing."""
     missing_set_point_limit: int = 5
-    """Interpolation periods without a set-point after which an enabled axis faults (8700h); 0 never does."""
+    """Default of 3050h: interpolation times without a set-point after which an enabled axis faults (8700h); 0 never
+    does."""
     cam_jump_window_counts: int = 64
     """How far the cam's demand may be from the axis when it is engaged."""
     sdo_timeout_s: float = 1.0

@@ -114,7 +114,7 @@ def _run_on_bus(
     def on_event(event: dict[str, Any]) -> None:
         if event.get("kind") == "learning":
             console.print(event["text"], soft_wrap=True, markup=False)
-        elif event.get("kind") in {"guard", "emergency", "heartbeat_lost", "recorder_lost"}:
+        elif event.get("kind") in {"guard", "guard_missing", "emergency", "heartbeat_lost", "recorder_lost"}:
             console.print(f"  {event['text']}", style="yellow", markup=False)
         elif event.get("kind") == "realtime" and not event.get("is_on"):
             console.print(f"  {event['text']}", style="dim", markup=False)

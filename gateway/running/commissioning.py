@@ -12,7 +12,7 @@ from drivers.errors import NoAnswerError, NodeError, SdoAbortedError
 from drivers.master import Master, Procedure
 from drivers.nmt import NmtCommand
 from drivers.node import Event
-from drivers.object_dictionary import DataType, Value
+from drivers.object_dictionary import DataType
 from drivers.pdo import (
     PDO_COB_ID_INVALID,
     PDO_COB_ID_NO_RTR,
@@ -21,8 +21,8 @@ from drivers.pdo import (
     TPDO_BASE,
     MappingEntry,
 )
-from drivers.sdo import AbortCode
 from gateway.errors import CommissioningError
+from gateway.running.drive_guards import DriveGuard, check_guards, is_absence, write_guards
 
 DEVICE_PROFILE_402: Final = 0x0192
 """Low word of 1000h of every CiA 402 drive."""
@@ -31,6 +31,8 @@ ABORT_CONNECTION_FAULT: Final = 1
 QUICK_STOP_RAMP: Final = 2
 """605Ah and 605Eh: a drive that is told to stop quickly, or faults with its amplifier whole, stops with the ramp 6085h
 and is without torque then; so the other axis can follow it, and a brake takes hold of an axis that stands."""
+RAMP_TOLERANCE: Final = 0.01
+"""Drives keep 6085h in units of their own."""
 PDO_COUNT: Final = 4
 U8, U16, U32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32
 I8, I16, I32 = DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32
@@ -74,6 +76,8 @@ class NodeSettings:
     """Where the gateway's guard trips; a drive that gives no more than that (6072h) is refused. None: not checked."""
     is_torque_controlled: bool = False
     """The gateway closes the position loop: cyclic synchronous torque."""
+    sync_watchdog: DriveGuard | None = None
+    """The drive's own watch over SYNC, as the configuration names it; None: left as the drive has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +113,7 @@ def for_all(nodes: Sequence[NodeSettings], step: Step) -> Procedure[None]:
 
 
 def commission(master: Master, nodes: Sequence[NodeSettings], network: NetworkSettings) -> Procedure[None]:
-    """Boot-up, identity, parameters, PDO mapping, heartbeats. Leaves the nodes pre-operational.
+    """Boot-up, identity, parameters, PDO mapping, heartbeats, guards read back. Leaves the nodes pre-operational.
 
     Raises CommissioningError.
     """
@@ -119,6 +123,8 @@ def commission(master: Master, nodes: Sequence[NodeSettings], network: NetworkSe
     yield from for_all(nodes, lambda node: map_pdos(master, node))
     yield from for_all(nodes, lambda node: set_up_heartbeats(master, node, network))
     since_ns = master.now_ns
+    # Read while the first heartbeats are awaited, it takes no time of its own.
+    yield from for_all(nodes, lambda node: read_back(master, node, network))
     yield from for_all(nodes, lambda node: hear_heartbeat(master, node, network, since_ns))
 
 
@@ -152,19 +158,48 @@ def check_identity(master: Master, node: NodeSettings) -> Procedure[None]:
         raise CommissioningError(problems)
 
 
+def parameter_guards(node: NodeSettings, network: NetworkSettings) -> list[DriveGuard]:
+    """What the cycle relies on, and what stops the axis without it, in the order in which it is written.
+
+    A drive whose quick stop ramp cannot be met to a per cent is another one than the limits were made for.
+    """
+    value, exponent = network.interpolation_time
+    period, cycle = objects.INTERPOLATION_TIME_PERIOD, objects.COMMUNICATION_CYCLE_PERIOD
+    window, connection = objects.FOLLOWING_ERROR_WINDOW, objects.ABORT_CONNECTION_OPTION_CODE
+    quick_stop, fault = objects.QUICK_STOP_OPTION_CODE, objects.FAULT_REACTION_OPTION_CODE
+    guards = [
+        DriveGuard("interpolation time period value", period, 1, U8, value),
+        DriveGuard("interpolation time index", period, 2, I8, exponent),
+        DriveGuard("communication cycle period", cycle, 0, U32, network.cycle_us, is_optional=True),
+        DriveGuard("following error window", window, 0, U32, node.following_error_window),
+        DriveGuard("abort connection option code", connection, 0, I16, ABORT_CONNECTION_FAULT, is_optional=True),
+        DriveGuard("quick stop option code", quick_stop, 0, I16, QUICK_STOP_RAMP, is_optional=True),
+        DriveGuard("fault reaction option code", fault, 0, I16, QUICK_STOP_RAMP, is_optional=True),
+    ]
+    if node.quick_stop_deceleration is not None:
+        ramp, deceleration = objects.QUICK_STOP_DECELERATION, node.quick_stop_deceleration
+        guards.append(DriveGuard("quick stop deceleration", ramp, 0, U32, deceleration, tolerance=RAMP_TOLERANCE))
+    if node.sync_watchdog is not None:
+        guards.append(node.sync_watchdog)
+    return guards
+
+
+def heartbeat_guard(network: NetworkSettings) -> DriveGuard:
+    """The drive's watch over the gateway's heartbeat."""
+    consumer = network.gateway_node_id << 16 | network.heartbeat_timeout_ms
+    return DriveGuard("consumer heartbeat time", objects.CONSUMER_HEARTBEAT_TIME, 1, U32, consumer, is_packed=True)
+
+
+def read_back(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
+    """Go on only with a drive that holds what guards it: some take a value without a word, and keep another one."""
+    guards = [*parameter_guards(node, network), heartbeat_guard(network)]
+    yield from check_guards(master, node.name, node.node_id, guards)
+
+
 def write_parameters(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
     """Write what the cycle relies on, and check the scales that the drive itself has, where it tells them."""
     node_id = node.node_id
-    value, exponent = network.interpolation_time
-    yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 1, U8, value)
-    yield from master.write(node_id, objects.INTERPOLATION_TIME_PERIOD, 2, I8, exponent)
-    yield from _write_if_there(master, node_id, objects.COMMUNICATION_CYCLE_PERIOD, U32, network.cycle_us)
-    yield from master.write(node_id, objects.FOLLOWING_ERROR_WINDOW, 0, U32, node.following_error_window)
-    yield from _write_if_there(master, node_id, objects.ABORT_CONNECTION_OPTION_CODE, I16, ABORT_CONNECTION_FAULT)
-    for option in (objects.QUICK_STOP_OPTION_CODE, objects.FAULT_REACTION_OPTION_CODE):
-        yield from _write_if_there(master, node_id, option, I16, QUICK_STOP_RAMP)
-    if node.quick_stop_deceleration is not None:
-        yield from master.write(node_id, objects.QUICK_STOP_DECELERATION, 0, U32, node.quick_stop_deceleration)
+    yield from write_guards(master, node_id, parameter_guards(node, network))
     rated = yield from _read_if_there(master, node_id, objects.MOTOR_RATED_TORQUE, 0)
     increments = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 1)
     revolutions = yield from _read_if_there(master, node_id, objects.POSITION_ENCODER_RESOLUTION, 2)
@@ -197,18 +232,9 @@ def _read_if_there(
     try:
         return (yield from master.read_int(node_id, index, subindex, data_type))
     except SdoAbortedError as error:
-        if error.code not in {AbortCode.OBJECT_DOES_NOT_EXIST, AbortCode.SUBINDEX_DOES_NOT_EXIST}:
+        if not is_absence(error):
             raise
         return None
-
-
-def _write_if_there(master: Master, node_id: int, index: int, data_type: DataType, value: Value) -> Procedure[None]:
-    """Write an object that the standard leaves optional; one that is there, and refuses the value, is a fault."""
-    try:
-        yield from master.write(node_id, index, 0, data_type, value)
-    except SdoAbortedError as error:
-        if error.code != AbortCode.OBJECT_DOES_NOT_EXIST:
-            raise
 
 
 def map_pdos(master: Master, node: NodeSettings) -> Procedure[None]:
@@ -262,8 +288,7 @@ def map_pdo(
 def set_up_heartbeats(master: Master, node: NodeSettings, network: NetworkSettings) -> Procedure[None]:
     """The drive's heartbeat, its watch over the gateway's, and our watch over the drive's."""
     node_id = node.node_id
-    consumer = network.gateway_node_id << 16 | network.heartbeat_timeout_ms
-    yield from master.write(node_id, objects.CONSUMER_HEARTBEAT_TIME, 1, U32, consumer)
+    yield from write_guards(master, node_id, [heartbeat_guard(network)])
     yield from master.write(node_id, objects.PRODUCER_HEARTBEAT_TIME, 0, U16, network.heartbeat_ms)
     master.watch_heartbeat(node_id, network.heartbeat_timeout_ms / 1000.0)
 

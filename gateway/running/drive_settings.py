@@ -1,12 +1,17 @@
 """What a configuration says of its drives, in the words of commissioning and the cycle: units, settings, the master."""
 
 import math
+from typing import Final
 
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
+from drivers.object_dictionary import DataType
 from gateway.cyclic.position_loop import PositionLoop
 from gateway.running.commissioning import NetworkSettings, NodeSettings
+from gateway.running.drive_guards import DriveGuard
 from gateway.units import AxisUnits
+
+_UNSIGNED: Final = {8: DataType.UNSIGNED8, 16: DataType.UNSIGNED16, 32: DataType.UNSIGNED32}
 
 
 def axis_units(axis: AxisSection) -> AxisUnits:
@@ -34,6 +39,14 @@ def position_loop(axis: AxisSection, cycle_s: float) -> PositionLoop | None:
     )
 
 
+def _sync_watchdog(axis: AxisSection, cycle_us: int) -> DriveGuard | None:
+    section = axis.sync_watchdog
+    if section is None:
+        return None
+    data_type = _UNSIGNED[section.bits]
+    return DriveGuard("SYNC watchdog", section.index, section.subindex, data_type, section.value(cycle_us))
+
+
 def node_settings(config: GatewayConfig) -> list[NodeSettings]:
     """What commissioning must know of each drive, master first."""
     return [
@@ -52,6 +65,7 @@ def node_settings(config: GatewayConfig) -> list[NodeSettings]:
             quick_stop_deceleration=_quick_stop_deceleration(axis),
             torque_limit_permille=config.guard.torque.limit_permille,
             is_torque_controlled=axis.position_loop is not None,
+            sync_watchdog=_sync_watchdog(axis, config.bus.cycle_us),
         )
         for name, axis in zip(config.axis_names, config.ordered_axes, strict=True)
     ]

@@ -12,6 +12,7 @@ from gateway.cyclic.guard import Condition, GuardTripped
 from gateway.cyclic.operation import OrderAnswered
 from gateway.running.commissioning import BootUpMissing
 from gateway.running.controller_watch import RestartTold
+from gateway.running.drive_guards import GuardMissing, GuardsSet
 from gateway.running.machine_session import StepReached
 from gateway.running.recovery import AxisRecovered
 
@@ -43,6 +44,8 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return "heartbeat_lost", f"node {node_id}: no heartbeat for {timeout_s:g} s", {"node_id": node_id}
         case BootUpReceived(_, node_id):
             return "boot_up", f"node {node_id} has booted up", {"node_id": node_id}
+        case GuardsSet() | GuardMissing():
+            return _describe_guards(event)
         case ControllerChanged() | RestartTold():
             return _describe_controller(event)
         case AxisRecovered(_, axis, is_ready, is_commissioned_anew, said):
@@ -62,6 +65,15 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             return "nmt_state", text, {"node_id": node_id, "state": state.name.lower()}
         case _:
             return _describe_other(event)
+
+
+def _describe_guards(event: GuardsSet | GuardMissing) -> tuple[str, str, EventData]:
+    if isinstance(event, GuardMissing):
+        guard = event.guard
+        text = f"axis {event.axis}: the drive has no {guard.place} ({guard.name})"
+        return "guard_missing", text, {"axis": event.axis, "object": guard.place}
+    held = ", ".join(f"{guard.place} {guard.show(guard.value)}" for guard in event.guards)
+    return "guards_set", f"axis {event.axis}: the drive holds {held}", {"axis": event.axis}
 
 
 def _describe_controller(event: ControllerChanged | RestartTold) -> tuple[str, str, EventData]:

@@ -117,6 +117,7 @@ class Axis(MeasuredMotion):
         "_torque_limits",
         "_torque_offset",
         "_touch_probe",
+        "_watchdog",
         "gains",
         "is_frozen",
         "is_switched_off",
@@ -152,6 +153,7 @@ class Axis(MeasuredMotion):
         self._following_error_timeout = entry(objects.FOLLOWING_ERROR_TIMEOUT)
         self._interpolation_value = entry(objects.INTERPOLATION_TIME_PERIOD, 1)
         self._interpolation_exponent = entry(objects.INTERPOLATION_TIME_PERIOD, 2)
+        self._watchdog = entry(objects.SET_POINT_WATCHDOG)
         self._torque_limits = (
             entry(objects.MAX_TORQUE),
             entry(objects.POSITIVE_TORQUE_LIMIT),
@@ -221,6 +223,7 @@ class Axis(MeasuredMotion):
             (objects.VELOCITY_ENCODER_RESOLUTION, 1): settings.counts_per_revolution,
             (objects.FEED_CONSTANT, 1): settings.counts_per_revolution,
             (objects.MOTOR_RATED_TORQUE, 0): round(settings.rated_torque_Nm * 1000.0),
+            (objects.SET_POINT_WATCHDOG, 0): settings.missing_set_point_limit,
         }
         if settings.gains is not None:
             if len(settings.gains) != CONTROLLER_GAIN_COUNT:
@@ -236,6 +239,7 @@ class Axis(MeasuredMotion):
         self._mode_entry.on_write = self._on_mode
         self._interpolation_value.on_write = self._on_interpolation_value
         self._interpolation_exponent.on_write = self._on_interpolation_exponent
+        self._watchdog.on_write = self._on_watchdog
         for entry in (*self._scale_entries, self.entry(objects.POLARITY)):
             entry.on_write = self._scaling_writer(entry)
         for place, entry in enumerate(self._torque_limits):
@@ -279,6 +283,7 @@ class Axis(MeasuredMotion):
         self.gains = tuple(entry.value for entry in self._gain_entries)
         self._limit_torque(*(entry.value for entry in self._torque_limits))
         self.set_period(self._interpolation_value.value, self._interpolation_exponent.value)
+        self.set_watchdog(self._watchdog.value)
         self.demand.hold(float(self.shaft_counts))
         self.show_status()
 
@@ -486,7 +491,8 @@ class Axis(MeasuredMotion):
 
     def lose_connection(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
         """The master is gone: EMCY, and, if the axis is enabled, what the option code 6007h says."""
-        action: int = self.entry(objects.ABORT_CONNECTION_OPTION_CODE).value if self.is_powered else 0
+        option = self.entry(objects.ABORT_CONNECTION_OPTION_CODE)
+        action = int(option.load(now_ns)) if self.is_powered else 0
         if action == AbortConnection.FAULT:
             self.trip(error_code, register_bits, now_ns, persists=persists)
             return
@@ -641,6 +647,10 @@ class Axis(MeasuredMotion):
         if self._active is not None and self._mode in _TIMED_MODES:
             return AbortCode.CANNOT_STORE_DEVICE_STATE
         self.set_period(value, exponent)
+        return None
+
+    def _on_watchdog(self, value: int, now_ns: int) -> AbortCode | None:
+        self.set_watchdog(value)
         return None
 
     # -- statusword ----------------------------------------------------------------------------------------------

@@ -122,7 +122,8 @@ class Motion(ABC):
         self.period_ns = 0
         """Interpolation time 60C2h."""
         self.period_s = 0.0
-        self._set_point_limit = settings.missing_set_point_limit
+        self._set_point_limit = 0
+        """Interpolation times without a set-point after which the drive faults; 0 never does."""
         self.controlword = self.entry(objects.CONTROLWORD)
         self.is_halted = False
         """Controlword bit 8 while operation is enabled: set-points wait."""
@@ -213,8 +214,14 @@ class Motion(ABC):
         """Take the interpolation time 60C2h, ``value`` times ten to the ``exponent`` seconds."""
         self.period_ns = value * 10 ** (9 + exponent)
         self.period_s = self.period_ns * _S_PER_NS
+        self.set_watchdog(self._set_point_limit)
+
+    def set_watchdog(self, limit: int) -> None:
+        """Take the set-point watchdog 3050h: ``limit`` interpolation times, 0 for none."""
+        self._set_point_limit = limit
         # Half a period of grace: the SYNC that is looked for may itself be a little late.
-        self.set_point_timeout_ns = self.period_ns * self._set_point_limit + self.period_ns // 2
+        self.set_point_timeout_ns = self.period_ns * limit + self.period_ns // 2
+        self.is_guarded = self.is_guarded and limit > 0
 
     def expect_next(self, now_ns: int) -> None:
         """Expect the next set-point within the time-out from now on."""

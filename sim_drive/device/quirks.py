@@ -150,6 +150,18 @@ def _remove_cyclic_position(drive: "Drive") -> None:
         _refuse_values(axis.entry(objects.MODES_OF_OPERATION), lambda value: value == mode)
 
 
+def _remove_abort_option(drive: "Drive") -> None:
+    _keep_abort_option(drive)
+    for axis in drive.axes:
+        place = axis.entry(objects.ABORT_CONNECTION_OPTION_CODE).variable.index, None
+        drive.dictionary.refusals[place] = AbortCode.OBJECT_DOES_NOT_EXIST
+
+
+def _keep_abort_option(drive: "Drive") -> None:
+    for axis in drive.axes:
+        axis.entry(objects.ABORT_CONNECTION_OPTION_CODE).on_read = lambda now_ns: 0
+
+
 def _refuse_torque_offset(drive: "Drive") -> None:
     def check(value: int) -> AbortCode | None:
         is_it = bool(value) and in_first_axis(MappingEntry.from_word(value).index) == objects.TORQUE_OFFSET
@@ -169,5 +181,7 @@ _APPLY: Final[Mapping[Quirk, Callable[["Drive"], None]]] = {
     Quirk.INTERPOLATION_TIME_IN_MILLISECONDS: _take_milliseconds_alone,
     Quirk.CYCLE_PERIOD_NEEDED: _need_cycle_period,
     Quirk.NO_CYCLIC_POSITION_MODE: _remove_cyclic_position,
+    Quirk.NO_ABORT_OPTION: _remove_abort_option,
+    Quirk.ABORT_OPTION_STAYS: _keep_abort_option,
     Quirk.TORQUE_OFFSET_NOT_MAPPABLE: _refuse_torque_offset,
 }

@@ -98,7 +98,17 @@ class _AxisTap:
 class _Tap:
     """Between one drive and its surroundings; a `sim_drive.machine.DriveTap`."""
 
-    __slots__ = ("_injector", "axes", "drive", "frame_faults", "is_cut_off", "is_mute", "place", "sdo_delay_ns")
+    __slots__ = (
+        "_injector",
+        "axes",
+        "drive",
+        "frame_faults",
+        "is_cut_off",
+        "is_mute",
+        "own_refusals",
+        "place",
+        "sdo_delay_ns",
+    )
 
     def __init__(self, injector: "Injector", place: int, drive: Drive) -> None:
         self._injector = injector
@@ -107,6 +117,8 @@ class _Tap:
         self.axes = tuple(_AxisTap() for _ in drive.axes)
         self.is_cut_off = False
         self.is_mute = False
+        self.own_refusals = dict(drive.dictionary.refusals)
+        """What the drive lacks in good health."""
         self.sdo_delay_ns = 0
         self.frame_faults: list[_FrameFault] = []
 
@@ -419,10 +431,11 @@ class Injector:
         elif kind is FaultKind.SLOW_SDO:
             tap.sdo_delay_ns = _span_ns(faults[-1].delay_s) if faults else 0
         elif kind is FaultKind.SDO_ABORT:
-            tap.drive.dictionary.refusals = {
+            injected = {
                 (fault.index or 0, fault.subindex): AbortCode(fault.abort_code or AbortCode.GENERAL_ERROR)
                 for fault in faults
             }
+            tap.drive.dictionary.refusals = tap.own_refusals | injected
         elif kind is FaultKind.WRONG_IDENTITY:
             self._set_identity(faults, tap.drive)
 

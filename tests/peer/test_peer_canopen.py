@@ -32,6 +32,8 @@ GAINS = [axis.emulation.gains for axis in load_config("paper").ordered_axes]
 # Where the value after a reset is not the EDS': (index, subindex) -> what it is, for node n.
 NOT_THE_DEFAULT: dict[tuple[int, int], Callable[[int], int]] = {
     (0x1018, 4): lambda node_id: node_id,
+    # The machine's configuration leaves the watchdog to commissioning.
+    (0x3050, 0): lambda _: 0,
     # Switch on disabled, voltage enabled, remote
     (0x6041, 0): lambda _: 0x0250,
     **{

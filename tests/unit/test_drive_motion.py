@@ -246,6 +246,35 @@ def test_no_fault_before_the_first_set_point_nor_without_a_limit_nor_when_off():
     assert bench.run(100 * MS) == []
 
 
+def test_the_watchdog_is_set_by_the_master_and_counts_interpolation_times():
+    bench = cyclic_bench(DriveSettings(missing_set_point_limit=0))
+    assert bench.read(0x3050) == 0
+    bench.must(0x3050, 0, 8, 2)
+    bench.cycle(10)  # a millisecond has passed since its SYNC
+    assert [bench.tick() for _ in range(7)] == [[]] * 7
+    assert bench.tick() == ["085#0087210000000000"]
+
+
+def test_the_watchdog_may_be_changed_and_switched_off_in_operation():
+    bench = cyclic_bench(DriveSettings(missing_set_point_limit=5))
+    bench.cycle(10)
+    bench.must(0x3050, 0, 20, 2)
+    assert [bench.tick() for _ in range(10)] == [[]] * 10
+    bench.must(0x3050, 0, 0, 2)
+    assert bench.run(100 * MS) == []
+    assert bench.drive.power_state is PowerState.OPERATION_ENABLED
+    assert bench.write(0x3050, 0, 1001, 2) == 0x06090031
+
+
+def test_a_restart_gives_the_watchdog_its_default_again():
+    bench = cyclic_bench(DriveSettings(missing_set_point_limit=5))
+    bench.must(0x3050, 0, 0, 2)
+    bench.nmt(0x81)
+    bench.run(10 * MS)
+    assert bench.read(0x3050) == 5
+    assert bench.drive.axis.set_point_timeout_ns == bench.drive.axis.period_ns * 11 // 2
+
+
 # -- following error ---------------------------------------------------------------------------------------------------
 
 

@@ -220,3 +220,24 @@ def test_without_a_cycle_period_no_sync_is_late() -> None:
     line.put(0x080)
     line.run(0.003)
     assert not line.read(0x6041) & 0x8000
+
+
+def test_the_abort_option_may_not_be_there_or_not_be_kept() -> None:
+    for quirks, answer, read in (((), 0, 3), ((Quirk.ABORT_OPTION_STAYS,), 0, 0)):
+        line = line_with(*quirks)
+        assert line.write(0x6007, 0, 3, 2) == answer
+        assert line.read(0x6007) == read
+    assert line_with(Quirk.NO_ABORT_OPTION).write(0x6007, 0, 1, 2) == 0x06020000
+
+
+@pytest.mark.parametrize(
+    ("quirks", "state"), [((), 0x08), ((Quirk.ABORT_OPTION_STAYS,), 0x27), ((Quirk.NO_ABORT_OPTION,), 0x27)]
+)
+def test_without_the_abort_option_a_lost_master_stops_nothing(quirks: tuple[Quirk, ...], state: int) -> None:
+    line = line_with(*quirks)
+    line.write(0x6007, 0, 1, 2)
+    assert line.write(0x1016, 1, 0x7F0032, 4) == 0
+    line.put(0x77F, "05")
+    line.enable()
+    line.run(0.2)
+    assert line.read(0x6041) & 0x6F == state

@@ -26,7 +26,8 @@ def machine(tmp_path):
     config["name"] = f"deaths-{os.getpid()}"
     config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
     config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    config["emulator"]["missing_sync_limit"] = 1000
+    for axis in config["axes"].values():
+        del axis["sync_watchdog"]
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 2000}
     config["guard"] |= {name: {"reaction": "warn"} for name in ("missed_tpdo", "missed_deadline", "axis_silent")}
     config["guard"]["sync_lost"] = {"limit_cycles": 100, "reaction": "warn"}

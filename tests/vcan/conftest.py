@@ -21,7 +21,8 @@ def unhurried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
     config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
     config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    config["emulator"]["missing_sync_limit"] = 1000
+    for axis in config["axes"].values():
+        del axis["sync_watchdog"]
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 1000}
     config["guard"] |= {name: {"reaction": "warn"} for name in LATENESS}
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}

@@ -19,8 +19,8 @@ class CyclicPosition(OperationMode):
     """Cyclic synchronous position mode.
 
     A target that a SYNC brings into effect is reached in a straight line one interpolation time (60C2h) later. If the
-    next one is missing, the line goes on for one more interpolation time, then the position is held; after
-    ``missing_set_point_limit`` interpolation times without a set-point the drive faults (8700h). A target by SDO or by
+    next one is missing, the line goes on for one more interpolation time, then the position is held; after as many
+    interpolation times without a set-point as the watchdog 3050h says the drive faults (8700h). A target by SDO or by
     an event-driven RPDO acts at once, promises no successor, and so is neither overrun nor guarded. The position offset
     60B0h is added to the target; the velocity offset 60B1h is fed forward to the controller, from the next target on.
     """
