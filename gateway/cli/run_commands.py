@@ -29,6 +29,7 @@ from gateway.cli.terminal import (
 
 if TYPE_CHECKING:
     from config.schema import GatewayConfig
+    from gateway.cli.event_lines import EventLines
     from gateway.cli.paper_demo import VirtualRunner
     from gateway.record.recording import Recording
     from gateway.running.bus_address import BusAddress
@@ -85,6 +86,22 @@ def _progress() -> Generator[tuple[Progress, Any]]:
         yield progress, progress.add_task("preparing", total=1.0, figure="")
 
 
+@contextmanager
+def _event_lines() -> "Generator[EventLines]":
+    """The events of a run on standard error; its steps too where that is no terminal, and so has no progress bar."""
+    from gateway.cli.event_lines import EventLines
+
+    console = messages()
+    lines = EventLines(
+        lambda text, style: console.print(text, style=style, markup=False, soft_wrap=True),
+        with_steps=not sys.stderr.isatty(),
+    )
+    try:
+        yield lines
+    finally:
+        lines.close()
+
+
 def _prepare(config: "GatewayConfig", cycles: int | None) -> "tuple[PreparedRun, str]":
     from gateway.running.preparation import prepare
     from mechanism.cam_file import cam_document
@@ -109,19 +126,10 @@ def _run_on_bus(
     from gateway.running.session import StopSwitch, run_realtime
 
     switch = StopSwitch()
-    console = messages()
-
-    def on_event(event: dict[str, Any]) -> None:
-        if event.get("kind") == "learning":
-            console.print(event["text"], soft_wrap=True, markup=False)
-        elif event.get("kind") in {"guard", "guard_missing", "emergency", "heartbeat_lost", "recorder_lost"}:
-            console.print(f"  {event['text']}", style="yellow", markup=False)
-        elif event.get("kind") == "realtime" and not event.get("is_on"):
-            console.print(f"  {event['text']}", style="dim", markup=False)
-
-    with _progress() as (progress, task), switch.installed():
+    with _progress() as (progress, task), switch.installed(), _event_lines() as lines:
 
         def on_progress(now: RunProgress) -> None:
+            lines.tick(time.monotonic_ns())
             progress.update(
                 task,
                 description=now.step,
@@ -142,7 +150,7 @@ def _run_on_bus(
             is_starting_anywhere=is_starting_anywhere,
             learn=learn,
             on_progress=on_progress,
-            on_event=on_event,
+            on_event=lines.tell,
         )
 
 
@@ -176,7 +184,7 @@ def _run_virtually(
     started = time.monotonic()
     reached_s = 0.0
     answered = 0
-    with _progress() as (progress, task), switch.installed():
+    with _progress() as (progress, task), switch.installed(), _event_lines() as lines:
 
         def on_progress(at_s: float, core: GatewayCore) -> None:
             nonlocal reached_s, answered
@@ -200,6 +208,7 @@ def _run_virtually(
             with_frames=with_frames,
             learning=None if store is None else store.learning(),
             on_progress=on_progress,
+            on_event=lines.tell,
         )
     if store is not None and store.keep(core):
         messages().print(f"what was learned is in {store.path}", soft_wrap=True, markup=False)

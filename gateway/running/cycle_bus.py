@@ -85,7 +85,7 @@ def _stamp_setting(address: BusAddress, wanted: Timestamps) -> RealTimeSetting:
     if address.interface == "socketcan":
         reason = why_no_hardware_stamps(address.channel)
     else:
-        reason = f"{address.interface} tells by which clock it stamps, if at all, to nobody"
+        reason = f"{address.interface} does not tell by which clock it stamps, if at all"
     if not reason:
         return RealTimeSetting(feature, True, f"by the clock of {address.channel}'s controller")
     if wanted is Timestamps.HARDWARE:

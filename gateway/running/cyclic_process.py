@@ -22,7 +22,6 @@ from drivers.cia402 import COMMAND_QUICK_STOP
 from drivers.errors import BusError, DriveError
 from drivers.frame import Frame
 from drivers.nmt import HEARTBEAT_BASE, SYNC_COB_ID
-from drivers.node import Event
 from drivers.ports import Port
 from drivers.real_time import RealTimeSetting, try_realtime
 from gateway.cyclic.cycle import RPDO_LAYOUT, SYNC_FRAME
@@ -232,6 +231,37 @@ def late_accountant(config: GatewayConfig, bus: CycleBus, ring: RingWriter) -> L
     )
 
 
+class Poll:
+    """What passes between core and ring: events and a sign of life out, stops and orders in; to be called often."""
+
+    def __init__(self, core: GatewayCore, ring: RingWriter) -> None:
+        self._core = core
+        self._ring = ring
+        self._answered = int(StopRequest.NONE)
+        self._ordered = 0
+        self._told: set[str] = set()
+
+    def __call__(self) -> None:
+        core, ring = self._core, self._ring
+        for event in core.take_events():
+            kind, text, data = describe(event)
+            ring.append_event(event.at_ns, kind, text, source="gateway", **data)
+            if core.failure is not None:
+                # The way back to standstill begins with an event and may take long; the user is to know at once.
+                self.tell_failure(core.failure)
+        ring.beat(time.monotonic_ns())
+        self._answered = pass_on_stop(core, ring.stop_request(), self._answered)
+        if ring.order_word() != self._ordered:
+            self._ordered = pass_on_order(core, ring.order_word())
+
+    def tell_failure(self, failure: Exception) -> None:
+        """Tell why the run has failed, each sentence once."""
+        for sentence in str(failure).splitlines():
+            if sentence not in self._told:
+                self._told.add(sentence)
+                self._ring.append_event(time.monotonic_ns(), "failure", sentence)
+
+
 def run_job(job: CyclicJob, ring: RingWriter) -> int:
     """Carry out the job; returns the process' exit status (0 done, 1 the machine said no)."""
     config = parse_config(job.config_text, Path(job.config_path))
@@ -257,22 +287,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     signal.signal(signal.SIGTERM, on_terminate)
     signal.signal(signal.SIGHUP, on_terminate)
     end_with(job.parent_pid)
-    answered = int(StopRequest.NONE)
-    ordered = 0
-
-    def on_event(event: Event) -> None:
-        kind, text, data = describe(event)
-        ring.append_event(event.at_ns, kind, text, source="gateway", **data)
-
-    def poll() -> None:
-        nonlocal answered, ordered
-        for event in core.take_events():
-            on_event(event)
-        ring.beat(time.monotonic_ns())
-        answered = pass_on_stop(core, ring.stop_request(), answered)
-        if ring.order_word() != ordered:
-            ordered = pass_on_order(core, ring.order_word())
-
+    poll = Poll(core, ring)
     bus: CycleBus | None = None
     stopped_by = StopReason.BUS_LOST
     try:
@@ -295,8 +310,7 @@ def run_job(job: CyclicJob, ring: RingWriter) -> int:
     if store is not None and failure is None:
         failure = keep_memory(store, core, ring)
     if failure is not None:
-        for sentence in str(failure).splitlines():
-            ring.append_event(time.monotonic_ns(), "failure", sentence)
+        poll.tell_failure(failure)
     ring.append_event(time.monotonic_ns(), "end", f"stopped by {stopped_by.value}", stopped_by=stopped_by.value)
     is_failed = failure is not None
     ring.set_state(RunState.FAILED if is_failed else RunState.FINISHED, int(is_failed))

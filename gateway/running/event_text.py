@@ -36,7 +36,8 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             where = f" on axis {axis}" if axis else ""
             name, answer = condition.value.replace("_", " "), reaction.value.replace("_", " ")
             text = f"{name}{where}: {_guarded_value(condition, value, limit)}, {answer}"
-            return "guard", text, {"condition": condition.value, "axis": axis, "value": value, "limit": limit}
+            data: EventData = {"condition": condition.value, "axis": axis, "value": value, "limit": limit}
+            return "guard", text, {**data, "reaction": reaction.value}
         case EmergencyReceived(_, node_id, code, register, vendor):
             text = f"node {node_id} EMCY {code:04X}h, error register {register:02X}h"
             return "emergency", text, {"node_id": node_id, "code": code, "vendor": vendor.hex()}

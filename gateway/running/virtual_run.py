@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from drivers.node import Event, Node
 from drivers.virtual_time import VirtualBus
@@ -35,11 +35,13 @@ def run_virtual(
     with_frames: bool = True,
     learning: Learning | None = None,
     on_progress: Callable[[float, GatewayCore], None] | None = None,
+    on_event: Callable[[dict[str, Any]], None] | None = None,
 ) -> GatewayCore:
     """Carry out a prepared run against ``machine``, record it to ``path``, and return the gateway's core afterwards.
 
     The recording is a function of configuration, cam, seed and what ``learning`` begins with, byte for byte.
-    ``on_progress`` is called with the virtual time in seconds now and then, and may ask the core for a stop.
+    ``on_progress`` is called with the virtual time in seconds now and then, and may ask the core for a stop;
+    ``on_event`` with every event of the gateway's, as the recording has it.
 
     Raises RecordingError if the file cannot be written, GatewayError if the session does not end.
     """
@@ -49,13 +51,15 @@ def run_virtual(
         sink = RecordingSink(writer)
         core = build_core(config, prepared.cam.profile, prepared.plan, sink, learning=learning)
 
-        def on_event(node: int, event: Event) -> None:
+        def note(node: int, event: Event) -> None:
             kind, text, data = describe(event)
             source = "gateway" if node == GATEWAY_NODE else "emulator"
             sink.append_event(event.at_ns, kind, text, source=source, **data)
+            if on_event is not None and node == GATEWAY_NODE:
+                on_event({"at_ns": event.at_ns, "kind": kind, "text": text, **data})
 
         bus = VirtualBus(
-            [core, machine], config.wire_bit_rate, seed, sink.trace if with_frames else None, on_event=on_event
+            [core, machine], config.wire_bit_rate, seed, sink.trace if with_frames else None, on_event=note
         )
         limit_ns = round((prepared.plan.duration_s + MAX_EXTRA_S) * NS_PER_S)
         while not core.is_done and bus.now_ns < limit_ns:

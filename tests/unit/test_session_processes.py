@@ -12,11 +12,12 @@ import pytest
 
 from config.loading import load_config
 from drivers.frame import Frame
-from gateway.errors import GatewayError
+from drivers.master import BootUpReceived
+from gateway.errors import CommissioningError, GatewayError
 from gateway.record.ring import StopRequest
 from gateway.running.bus_address import resolve_bus
 from gateway.running.cycle_host import run_core
-from gateway.running.cyclic_process import pass_on_stop, refuse_other_master
+from gateway.running.cyclic_process import Poll, pass_on_stop, refuse_other_master
 from gateway.running.session import StopSwitch
 
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -70,6 +71,52 @@ def test_each_signal_asks_for_what_the_guard_says_of_it():
             assert switch.request is request
             signal.raise_signal(number)
             assert switch.request is StopRequest.QUICK_STOP
+
+
+class TellingCore:
+    """A core that has an event in every second poll, and a failure when it is given one."""
+
+    failure = None
+
+    def __init__(self):
+        self.polls = 0
+
+    def take_events(self):
+        self.polls += 1
+        return [BootUpReceived(self.polls, 2)] if self.polls % 2 else []
+
+
+class ListRing:
+    def __init__(self):
+        self.events = []
+
+    def append_event(self, _at_ns, kind, text, **_data):
+        self.events.append((kind, text))
+
+    def beat(self, _now_ns):
+        pass
+
+    def stop_request(self):
+        return 0
+
+    def order_word(self):
+        return 0
+
+
+def test_a_failure_is_told_with_the_next_event_and_each_sentence_once():
+    core, ring = TellingCore(), ListRing()
+    poll = Poll(core, ring)
+    poll()
+    core.failure = CommissioningError(["axis cv: one thing", "axis servo: another"])
+    for _ in range(4):
+        poll()
+    poll.tell_failure(GatewayError("axis cv: one thing\nand the bus is lost"))
+    assert [text for kind, text in ring.events if kind == "failure"] == [
+        "axis cv: one thing",
+        "axis servo: another",
+        "and the bus is lost",
+    ]
+    assert [kind for kind, _ in ring.events] == ["boot_up", "boot_up", "failure", "failure", "boot_up", "failure"]
 
 
 class LateCore:
