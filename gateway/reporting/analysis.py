@@ -11,8 +11,8 @@ was missed hold an old actual value: they are counted, and left out of its figur
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -24,6 +24,7 @@ from gateway.record.recording import CAM_ATTACHMENT, Recording, RecordingError
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import MISSED_TPDO_MASK, Phase, SampleArray
 from gateway.reporting.cycle_errors import CycleErrors, cycle_errors
+from gateway.reporting.event_choice import DecisiveEvent, decisive_events, event_counts
 from gateway.reporting.paper_reference import TABLE_II, PrecisionPoint, is_reference_machine
 from mechanism.cam_file import parse_cam_file
 from mechanism.cam_profile import CamProfile
@@ -170,6 +171,10 @@ class RunReport:
     stopped_by: str
     late: LateRecord | None = None
     """Why demands were late; None where nobody kept account of that, as in virtual time."""
+    decisive: tuple[DecisiveEvent, ...] = ()
+    """What stopped the run, ended it, and became of the machine, in its order."""
+    event_counts: Mapping[str, int] = field(default_factory=dict[str, int])
+    """Events of each kind, all of them."""
 
     def to_json(self) -> dict[str, Any]:
         """The report as a JSON object of stable keys: no NaN, figures rounded to 6 decimals, null for "none"."""
@@ -187,6 +192,10 @@ class RunReport:
             "recording": self.recording,
             "recording_is_complete": self.recording_is_complete,
             "stopped_by": self.stopped_by,
+            "events": {
+                "counts": dict(self.event_counts),
+                "decisive": [asdict(event) for event in self.decisive],
+            },
         }
 
 
@@ -283,12 +292,20 @@ def _angles(counts: FloatArray, constants: RunConstants) -> FloatArray:
 
 def analyse(recording: Recording) -> RunReport:
     """The figures of a recorded run."""
+    return report_of_recording(recording, prepare(recording.samples, recording.constants, cam_of(recording)))
+
+
+def report_of_recording(recording: Recording, data: RunData) -> RunReport:
+    """The figures of a recording whose samples are prepared already."""
+    events = [event.data for event in recording.events]
     return report_of(
-        prepare(recording.samples, recording.constants, cam_of(recording)),
+        data,
         recording=str(recording.path),
         recording_is_complete=recording.is_complete,
         stopped_by=recording.stopped_by,
-        late=late_record(event.data for event in recording.events),
+        late=late_record(events),
+        decisive=decisive_events(events, recording.metadata.start_ns),
+        event_counts=event_counts(events),
     )
 
 
@@ -299,6 +316,8 @@ def report_of(
     recording_is_complete: bool = True,
     stopped_by: str = "unknown",
     late: LateRecord | None = None,
+    decisive: tuple[DecisiveEvent, ...] = (),
+    event_counts: Mapping[str, int] | None = None,
 ) -> RunReport:
     """The figures of prepared samples."""
     return RunReport(
@@ -314,6 +333,8 @@ def report_of(
         recording_is_complete=recording_is_complete,
         stopped_by=stopped_by,
         late=late,
+        decisive=decisive,
+        event_counts=event_counts or {},
     )
 
 

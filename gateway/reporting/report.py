@@ -5,10 +5,11 @@ from html import escape
 from pathlib import Path
 from typing import Final
 
-from gateway.record.lateness import IN_WORDS, LATE_KINDS, LateKind, late_record
+from gateway.record.lateness import IN_WORDS, LateKind
 from gateway.record.recording import Recording, RecordingError, read_recording
 from gateway.reporting import paper_reference as paper
-from gateway.reporting.analysis import RunData, RunReport, cam_of, prepare, report_of
+from gateway.reporting.analysis import RunData, RunReport, cam_of, prepare, report_of_recording
+from gateway.reporting.event_choice import choose_events, is_alarming
 from gateway.reporting.number_text import number
 from gateway.reporting.plots import Plot, plots_of, to_png, to_svg
 from gateway.reporting.report_page import PAGE, STYLE
@@ -24,7 +25,6 @@ from gateway.reporting.report_text import (
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"
-_MAX_EVENTS: Final = 200
 
 
 def write_report(recording_path: Path, out_dir: Path) -> list[Path]:
@@ -34,13 +34,7 @@ def write_report(recording_path: Path, out_dir: Path) -> list[Path]:
     """
     recording = read_recording(recording_path)
     data = prepare(recording.samples, recording.constants, cam_of(recording))
-    report = report_of(
-        data,
-        recording=str(recording.path),
-        recording_is_complete=recording.is_complete,
-        stopped_by=recording.stopped_by,
-        late=late_record(event.data for event in recording.events),
-    )
+    report = report_of_recording(recording, data)
     if not len(recording.samples):
         raise RecordingError(recording_path, "holds no cycle to report on")
     plots = plots_of(data)
@@ -212,26 +206,25 @@ def _late_table(recording: Recording, report: RunReport) -> str:
 
 
 def _events(recording: Recording) -> str:
-    events = [event for event in recording.events if event.data.get("kind") not in LATE_KINDS]
-    if not events:
+    choice = choose_events([event.data for event in recording.events])
+    if not choice.shown:
         return "<p>None was recorded.</p>"
     start = recording.metadata.start_ns
-    shown = events[:_MAX_EVENTS]
     body = "".join(
         _row(
             [
-                f"{(int(event.data['at_ns']) - start) / 1e9:.3f} s",
-                str(event.data.get("source", "")),
-                str(event.data.get("kind", "")),
-                str(event.data.get("text", "")),
+                f"{(int(event['at_ns']) - start) / 1e9:.3f} s",
+                str(event.get("source", "")),
+                str(event.get("kind", "")).replace("_", " "),
+                str(event.get("text", "")),
             ],
-            classes=("left", "left", "left"),
+            classes=("left", "left", "left bad" if is_alarming(event) else "left"),
         )
-        for event in shown
+        for event in choice.shown
     )
-    more = len(events) - len(shown)
-    rest = f"<p>… and {more} more in the recording.</p>" if more > 0 else ""
-    return f'<div class="scroll"><table><tbody>{body}</tbody></table></div>{rest}'
+    rest = choice.left_out_text()
+    told = f"<p>Not shown here, and in the recording: {escape(rest)}.</p>" if rest else ""
+    return f'<div class="scroll"><table><tbody>{body}</tbody></table></div>{told}'
 
 
 def _about(recording: Recording, report: RunReport) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Final
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -13,6 +14,7 @@ from gateway.reporting import paper_reference as paper
 from gateway.reporting.analysis import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
 from gateway.reporting.number_text import NOTHING, number, row_of_numbers
 
+MOST_LINES: Final = 20
 _COUNTED_FAULTS = frozenset(
     {
         "TPDOs missed",
@@ -196,7 +198,7 @@ def render_report(report: RunReport) -> RenderableType:
     parts.append(_end_effector(report))
     if report.table_ii:
         parts.append(_table_ii(report))
-    cycle = _table("Cycle, over every record")
+    cycle = _table("Cycle, over every record", has_header=False)
     cycle.add_column("")
     cycle.add_column("", justify="right")
     for what, figure in cycle_rows(report.cycle):
@@ -205,13 +207,37 @@ def render_report(report: RunReport) -> RenderableType:
     verdict = late_row(report)
     if verdict is not None:
         parts.append(Text(": ".join(verdict), style="bold red" if is_verdict_bad(report) else ""))
+    parts.extend(_decisive_lines(report))
     if report.recording:
         parts.append(Text(f"recording: {report.recording}", style="dim"))
     return Group(*parts)
 
 
-def _table(title: str) -> Table:
-    return Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+def _decisive_lines(report: RunReport) -> list[Text]:
+    """What stopped the run and became of the machine; nothing after a run that just completed."""
+    told = [event for event in report.decisive if event.kind != "end"]
+    if not told:
+        return []
+    lines = [Text(), Text("What stopped it, and what became of the machine", style="bold")]
+    for event in told[:MOST_LINES]:
+        style = "bold red" if event.is_alarming else ""
+        lines.append(Text(f"  {event.at_s:9.3f} s  {event.kind}: {event.text}", style=style))
+    if len(told) > MOST_LINES:
+        lines.append(Text(f"  and {len(told) - MOST_LINES} more, see the report's page", style="dim"))
+    return lines
+
+
+def _table(title: str, has_header: bool = True) -> Table:
+    return Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=box.SIMPLE_HEAD,
+        pad_edge=False,
+        # A narrow table would break its title.
+        min_width=len(title),
+        show_header=has_header,
+    )
 
 
 def _whole_run_table(report: RunReport) -> Table:
