@@ -29,8 +29,9 @@ _STYLES: Final[Mapping[str, str]] = {
 }
 """Kinds of events that are told, and how they look."""
 _EXPECTED: Final = frozenset({"boot_up", "nmt_state"})
-"""Part of every commissioning, and news only once the machine was to move."""
-_MOTION: Final = frozenset({"moving", "approaching the cam"})
+"""Part of every commissioning and of every good end, and news only while the machine is to move."""
+_NEWS_FROM: Final = frozenset({"moving", "approaching the cam"})
+_NEWS_UNTIL: Final = "done"
 _SORTED_BY: Final = ("kind", "condition", "axis", "node_id", "object", "reaction")
 
 Print = Callable[[str, str], None]
@@ -56,19 +57,20 @@ class EventLines:
         self._with_steps = with_steps
         self._sorts: dict[tuple[Any, ...], _Sort] = {}
         self._failures: list[tuple[int, str]] = []
-        self._now_ns = 0
-        self._has_moved = False
+        self.now_ns = 0
+        """How far the run has come, by its events and ``tick``."""
+        self._is_in_motion = False
 
     def tell(self, event: Mapping[str, Any]) -> None:
         """An event has come, as the run's log has it: ``kind``, ``text``, ``at_ns`` and more."""
         kind, text = str(event.get("kind")), str(event.get("text"))
-        self.tick(int(event.get("at_ns", self._now_ns)))
+        self.tick(int(event.get("at_ns", self.now_ns)))
         if kind == "step":
-            self._has_moved = self._has_moved or text in _MOTION
+            self._is_in_motion = text in _NEWS_FROM or (self._is_in_motion and text != _NEWS_UNTIL)
             if self._with_steps:
                 self._print(text, "dim")
         elif kind == "failure":
-            self._failures.append((self._now_ns, text))
+            self._failures.append((self.now_ns, text))
         elif kind == "realtime" and not event.get("is_on"):
             self._print(f"  {text}", "dim")
         elif kind in _UNLIMITED:
@@ -77,14 +79,14 @@ class EventLines:
             self._tell_sparingly(tuple(event.get(key) for key in _SORTED_BY), text, self._style(event, kind))
 
     def _style(self, event: Mapping[str, Any], kind: str) -> str:
-        if kind in _EXPECTED and not self._has_moved:
+        if kind in _EXPECTED and not self._is_in_motion:
             return "dim"
         if kind == "guard" and event.get("reaction", Reaction.WARN.value) != Reaction.WARN.value:
             return "bold yellow"
         return _STYLES[kind]
 
     def _tell_sparingly(self, key: tuple[Any, ...], text: str, style: str) -> None:
-        sort = self._sorts.setdefault(key, _Sort(self._now_ns))
+        sort = self._sorts.setdefault(key, _Sort(self.now_ns))
         if sort.told < MOST_LINES:
             sort.told += 1
             self._print(f"  {text}", style)
@@ -94,12 +96,12 @@ class EventLines:
 
     def tick(self, now_ns: int) -> None:
         """The run has come to ``now_ns``: tell what was held back and is due."""
-        self._now_ns = max(now_ns, self._now_ns)
-        over = [key for key, sort in self._sorts.items() if self._now_ns - sort.since_ns >= SPAN_NS]
+        self.now_ns = max(now_ns, self.now_ns)
+        over = [key for key, sort in self._sorts.items() if self.now_ns - sort.since_ns >= SPAN_NS]
         for key in over:
             self._tell_count(self._sorts.pop(key))
-        due = [text for at_ns, text in self._failures if self._now_ns - at_ns >= HOLD_NS]
-        self._failures = [(at_ns, text) for at_ns, text in self._failures if self._now_ns - at_ns < HOLD_NS]
+        due = [text for at_ns, text in self._failures if self.now_ns - at_ns >= HOLD_NS]
+        self._failures = [(at_ns, text) for at_ns, text in self._failures if self.now_ns - at_ns < HOLD_NS]
         for text in due:
             self._print(f"  {text}", "bold red")
 

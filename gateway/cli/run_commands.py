@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from gateway.cli.terminal import (
@@ -87,14 +88,15 @@ def _progress() -> Generator[tuple[Progress, Any]]:
 
 
 @contextmanager
-def _event_lines() -> "Generator[EventLines]":
-    """The events of a run on standard error; its steps too where that is no terminal, and so has no progress bar."""
+def _event_lines(console: Console) -> "Generator[EventLines]":
+    """The events of a run on the progress bar's own console, which makes room for them; its steps too where there is
+    no terminal, and so no bar.
+    """
     from gateway.cli.event_lines import EventLines
 
-    console = messages()
     lines = EventLines(
         lambda text, style: console.print(text, style=style, markup=False, soft_wrap=True),
-        with_steps=not sys.stderr.isatty(),
+        with_steps=not console.is_terminal,
     )
     try:
         yield lines
@@ -126,7 +128,7 @@ def _run_on_bus(
     from gateway.running.session import StopSwitch, run_realtime
 
     switch = StopSwitch()
-    with _progress() as (progress, task), switch.installed(), _event_lines() as lines:
+    with _progress() as (progress, task), switch.installed(), _event_lines(progress.console) as lines:
 
         def on_progress(now: RunProgress) -> None:
             lines.tick(time.monotonic_ns())
@@ -184,7 +186,7 @@ def _run_virtually(
     started = time.monotonic()
     reached_s = 0.0
     answered = 0
-    with _progress() as (progress, task), switch.installed(), _event_lines() as lines:
+    with _progress() as (progress, task), switch.installed(), _event_lines(progress.console) as lines:
 
         def on_progress(at_s: float, core: GatewayCore) -> None:
             nonlocal reached_s, answered

@@ -18,13 +18,18 @@ LEAST_OTHERS: Final = 50
 """Places for the other events, however many decisive ones there are."""
 _ALWAYS: Final = frozenset({"failure", "recovery", "end", "recorder_lost"})
 _WEIGHTS: Final[Mapping[str, int]] = {
-    **dict.fromkeys(("guard", "emergency", "heartbeat_lost", "controller", "boot_up", "step", "order", "warning"), 1),
+    **dict.fromkeys(
+        ("guard", "guard_missing", "emergency", "heartbeat_lost", "controller", "boot_up", "step", "order", "warning"),
+        1,
+    ),
+    **dict.fromkeys(("guard", "guard_missing", "emergency", "heartbeat_lost", "controller"), 1),
+    **dict.fromkeys(("boot_up", "step", "order", "warning"), 1),
     **dict.fromkeys(("nmt_state", "learning", "bus", "realtime"), 2),
     "late": 4,
 }
 _OTHER_WEIGHT: Final = 3
 _WISHES: Final = frozenset(condition.value for condition in WISHES)
-_GROUPED_BY: Final = ("kind", "condition", "axis", "node_id")
+_GROUPED_BY: Final = ("kind", "condition", "axis", "node_id", "object")
 
 
 @dataclass(frozen=True, slots=True)

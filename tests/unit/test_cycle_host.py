@@ -324,7 +324,9 @@ def test_whose_stamps_are_used_is_told_and_why(monkeypatch, wanted, refusal, is_
     assert not bus.service.has_hardware_stamps
 
 
-@pytest.mark.parametrize(("interface", "why"), [("socketcan", "vcan0 has none"), ("socketcand", "socketcand tells")])
+@pytest.mark.parametrize(
+    ("interface", "why"), [("socketcan", "vcan0 has none"), ("socketcand", "socketcand does not tell")]
+)
 def test_hardware_stamps_that_are_not_to_be_had_are_one_sentence(monkeypatch, interface, why):
     monkeypatch.setattr(cycle_bus, "why_no_hardware_stamps", lambda channel: f"{channel} has none")
     address = BusAddress(interface, "vcan0", "127.0.0.1", 29536)

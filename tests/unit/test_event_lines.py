@@ -58,10 +58,15 @@ def test_recovery_boot_up_emergency_and_bus_off_are_told():
     assert terminal.styles["node 2 has booted up"] == "yellow"
 
 
-def test_what_every_commissioning_has_is_told_quietly():
+def test_what_every_commissioning_and_every_end_has_is_told_quietly():
     terminal = Terminal()
-    terminal.tell(BootUpReceived(0, 2))
-    assert terminal.styles["node 2 has booted up"] == "dim"
+    styles = []
+    for step in ("homing axis cv", "moving", "recovering the axes", "done"):
+        terminal.say("step", step)
+        terminal.tell(BootUpReceived(0, 2))
+        styles.append(terminal.styles.pop("node 2 has booted up"))
+        terminal.events.tick(terminal.events.now_ns + SPAN_NS)
+    assert styles == ["dim", "yellow", "yellow", "dim"]
 
 
 def test_a_thousand_warnings_are_a_few_lines_and_a_count_and_hide_no_other():
