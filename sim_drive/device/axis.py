@@ -1,7 +1,8 @@
 """The drive's application: the CiA 402 device behind the object dictionary.
 
-The axis keeps the power state machine, statusword and controlword, the following error and what a SYNC samples; what a
-mode of operation does with set-points is in `modes`, and what the two share in `motion`.
+The axis runs its servo tick, selects the mode of operation, guards the following error and composes the statusword.
+The power state machine is in `power_drive`, what a SYNC samples in `measured`, what a mode of operation does with
+set-points in `modes`, and what they all share in `motion`.
 """
 
 from collections.abc import Callable
@@ -15,22 +16,13 @@ from sim_drive.communication.dictionary import Entry, LiveDictionary
 from sim_drive.communication.emcy import AxisErrors, EmergencyCode, ErrorRegister
 from sim_drive.device.cam_slots import CamSlots
 from sim_drive.device.cia402 import (
-    COMMANDS,
     MODES,
-    QUICK_STOP_STAYS,
     STATE_BITS,
-    STOP_RAMPS,
-    AbortConnection,
     Controlword,
     Mode,
-    PowerCommand,
     PowerState,
-    PowerStateChanged,
     Statusword,
-    StopRamp,
-    next_state,
 )
-from sim_drive.device.measured import MeasuredMotion
 from sim_drive.device.modes.base import Holding, OperationMode
 from sim_drive.device.modes.camming import Camming
 from sim_drive.device.modes.cyclic import CyclicPosition, CyclicTorque, CyclicVelocity
@@ -40,6 +32,7 @@ from sim_drive.device.modes.profile_position import ProfilePosition
 from sim_drive.device.modes.profile_torque import ProfileTorque
 from sim_drive.device.modes.profile_velocity import ProfileVelocity
 from sim_drive.device.motion import Latch, SetPointSource, wrap_int32
+from sim_drive.device.power_drive import NO_CONTROLWORD, PowerDrive
 from sim_drive.device.quirks import MODE_SWITCH_NS, SYNC_PATIENCE_NS
 from sim_drive.device.touch_probe import TouchProbe
 from sim_drive.settings import DriveSettings
@@ -58,17 +51,10 @@ _BASE_BITS: Final = int(Statusword.VOLTAGE_ENABLED | Statusword.REMOTE)
 _FOLLOWING_ERROR: Final = int(Statusword.FOLLOWING_ERROR)
 _LIMITED: Final = int(Statusword.INTERNAL_LIMIT_ACTIVE)
 _FROZEN: Final = int(Statusword.FROZEN)
-_FAULT_RESET: Final = int(Controlword.FAULT_RESET)
 _HALT: Final = int(Controlword.HALT)
-_OPTION_CODES: Final = {
-    PowerState.SWITCHED_ON: objects.DISABLE_OPERATION_OPTION_CODE,
-    PowerState.READY_TO_SWITCH_ON: objects.SHUTDOWN_OPTION_CODE,
-}
-"""How the axis stops on its way from Operation enabled to these states."""
 _DRIVE_ERROR: Final = int(ErrorRegister.DEVICE_PROFILE)
 # Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
 _OPERATION_ENABLED: Final = PowerState.OPERATION_ENABLED
-_NO_CONTROLWORD: Final = -1
 _TIMED_MODES: Final = frozenset(
     {
         Mode.CYCLIC_SYNCHRONOUS_POSITION,
@@ -81,28 +67,20 @@ _TIMED_MODES: Final = frozenset(
 """Modes in which the interpolation time must not change."""
 
 
-class Axis(MeasuredMotion):
-    """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it.
-
-    A ramp before a state is left (605Bh, 605Ch) is run in the state; enabling the operation again calls it off.
-    """
+class Axis(PowerDrive):
+    """One CiA 402 axis. ``on_tick`` is its servo tick, ``sample`` and ``on_sync`` are what a SYNC does to it."""
 
     __slots__ = (
         "_active",
-        "_after_ramp",
         "_coming_mode",
         "_cycle_period",
         "_enabled_bits",
-        "_errors",
-        "_events",
-        "_following_error_since_ns",
         "_following_error_timeout",
         "_following_error_window",
         "_freezes",
         "_gain_entries",
         "_has_stops",
         "_homing",
-        "_idle_controlword",
         "_interpolation_exponent",
         "_interpolation_value",
         "_mode",
@@ -110,7 +88,6 @@ class Axis(MeasuredMotion):
         "_mode_entry",
         "_modes",
         "_rated_torque_Nm",
-        "_state",
         "_statusword",
         "_synced_at_ns",
         "_ticking",
@@ -120,11 +97,8 @@ class Axis(MeasuredMotion):
         "_watchdog",
         "gains",
         "is_frozen",
-        "is_switched_off",
         "negative_torque_limit_Nm",
-        "node_id",
         "on_sync",
-        "position_demand_counts",
         "torque_limit_Nm",
     )
 
@@ -138,11 +112,7 @@ class Axis(MeasuredMotion):
         events: list[Event],
         number: int = 1,
     ) -> None:
-        super().__init__(dictionary, settings, number)
-        self.node_id = node_id
-        """For its events alone; the drive changes it when it gets another one."""
-        self._errors = errors
-        self._events = events
+        super().__init__(node_id, dictionary, settings, errors, events, number)
 
         entry = self.entry
         self._statusword = entry(objects.STATUSWORD)
@@ -188,17 +158,7 @@ class Axis(MeasuredMotion):
         """The active mode if it has something to do at every servo tick."""
         self.on_sync: Callable[[int], None] = _nothing
         """Let the set-points that the synchronous RPDOs have brought act: the active mode's own."""
-        self._idle_controlword = _NO_CONTROLWORD
-        """The controlword that asks, as the one before it, for nothing new in the present state and mode."""
-        self.position_demand_counts = 0.0
-        """Demand at the last servo tick, shaft frame."""
-        self._state = PowerState.NOT_READY_TO_SWITCH_ON
         self._mode = Mode.NONE
-        self.is_switched_off = False
-        """Without supply, as the drive has it."""
-        self._after_ramp: PowerState | None = None
-        """The state that is next when the axis has come to rest."""
-        self._following_error_since_ns: int | None = None
         self._coming_mode: tuple[int, int] | None = None
         """With a slow mode switch: the mode, and when it is entered."""
         has_limit_switches = bool(settings.switches.fitted & ~DigitalInput.HOME)
@@ -235,7 +195,6 @@ class Axis(MeasuredMotion):
             entry.value = value
 
     def _set_hooks(self) -> None:
-        self.controlword.on_write = self._on_controlword
         self._mode_entry.on_write = self._on_mode
         self._interpolation_value.on_write = self._on_interpolation_value
         self._interpolation_exponent.on_write = self._on_interpolation_exponent
@@ -273,7 +232,7 @@ class Axis(MeasuredMotion):
         for mode in self._modes.values():
             mode.reset()
         self._touch_probe.restore()
-        self._idle_controlword = _NO_CONTROLWORD
+        self._idle_controlword = NO_CONTROLWORD
         self.set_scaling()
         self.offset = self.settings.initial_offset_counts
         self.power(False)
@@ -288,11 +247,6 @@ class Axis(MeasuredMotion):
         self.show_status()
 
     # -- what the machine reads ----------------------------------------------------------------------------------
-
-    @property
-    def state(self) -> PowerState:
-        """State of the power drive system."""
-        return self._state
 
     @property
     def mode(self) -> Mode:
@@ -411,151 +365,21 @@ class Axis(MeasuredMotion):
         self.set_internal_bit(_FOLLOWING_ERROR, True)
         self.trip(EmergencyCode.FOLLOWING_ERROR, _DRIVE_ERROR, now_ns)
 
-    # -- controlword and state -----------------------------------------------------------------------------------
-
-    def _on_controlword(self, value: int, now_ns: int) -> AbortCode | None:
-        if value == self._idle_controlword:
-            return None
-        self._idle_controlword = _NO_CONTROLWORD
-        before: int = self.controlword.value
-        if value & ~before & _FAULT_RESET and self._state is PowerState.FAULT:
-            if not self._errors.has_persisting_fault:
-                self._errors.reset_fault(now_ns)
-                self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
-            return None
-        command = COMMANDS[value & 0xFF]
-        state = self._state
-        self._execute(command, now_ns)
-        if command is PowerCommand.ENABLE_OPERATION and state is PowerState.READY_TO_SWITCH_ON:
-            self._execute(command, now_ns)
-        active = self._active
-        if active is not None:
-            active.on_controlword(value, now_ns)
-            is_halted = bool(value & _HALT)
-            if is_halted is not self.is_halted and self._active is active:
-                self.is_halted = is_halted
-                if is_halted:
-                    active.halt(now_ns)
-                else:
-                    active.resume(now_ns)
-                self.show_status()
-        if value == before and next_state(self._state, command) is self._state:
-            self._idle_controlword = value
-        return None
-
-    def _execute(self, command: PowerCommand, now_ns: int) -> None:
-        state = self._state
-        after = next_state(state, command)
-        if state is not _OPERATION_ENABLED:
-            # There is no way back from a quick stop that is to end in another state (transition 16).
-            if after is not state and (after is not _OPERATION_ENABLED or self._after_ramp is None):
-                self._go_to_state(after, now_ns)
-            return
-        if after is state:
-            if command is PowerCommand.ENABLE_OPERATION and self._after_ramp is not None:
-                self._after_ramp = None
-                self._activate(now_ns)
-                self.show_status()
-            return
-        if after is PowerState.QUICK_STOP_ACTIVE:
-            self._quick_stop(now_ns)
-            return
-        index = _OPTION_CODES.get(after)
-        if index is not None and self._option(index) is not StopRamp.NONE:
-            if self._after_ramp is None:
-                self._stop(StopRamp.SLOW_DOWN, now_ns)
-                self.show_status()
-            if not self.demand.is_over(now_ns):
-                self._after_ramp = after
-                return
-        self._go_to_state(after, now_ns)
-
-    def _quick_stop(self, now_ns: int) -> None:
-        code: int = self.entry(objects.QUICK_STOP_OPTION_CODE).value
-        if code == StopRamp.NONE:
-            self._go_to_state(PowerState.SWITCH_ON_DISABLED, now_ns)
-            return
-        stays = code >= QUICK_STOP_STAYS
-        self._stop(STOP_RAMPS[code - QUICK_STOP_STAYS + 1 if stays else code], now_ns)
-        self._go_to_state(PowerState.QUICK_STOP_ACTIVE, now_ns)
-        self._after_ramp = None if stays else PowerState.SWITCH_ON_DISABLED
-
-    def _option(self, index: int) -> StopRamp:
-        value: int = self.entry(index).value
-        return STOP_RAMPS[value]
-
-    def _stop(self, ramp: StopRamp, now_ns: int) -> None:
-        """Leave the active mode, and let the demand come to rest."""
-        self._deactivate(now_ns)
-        self.brake(self.deceleration_of(ramp), now_ns)
-
-    def lose_connection(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
-        """The master is gone: EMCY, and, if the axis is enabled, what the option code 6007h says."""
-        option = self.entry(objects.ABORT_CONNECTION_OPTION_CODE)
-        action = int(option.load(now_ns)) if self.is_powered else 0
-        if action == AbortConnection.FAULT:
-            self.trip(error_code, register_bits, now_ns, persists=persists)
-            return
-        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=persists)
-        if action == AbortConnection.DISABLE_VOLTAGE:
-            self._execute(PowerCommand.DISABLE_VOLTAGE, now_ns)
-        elif action == AbortConnection.QUICK_STOP:
-            self._execute(PowerCommand.QUICK_STOP, now_ns)
-        self._idle_controlword = _NO_CONTROLWORD
-
-    def _go_to_state(self, state: PowerState, now_ns: int) -> None:
-        before = self._state
-        if state is before:
-            return
-        self._state = state
-        self._after_ramp = None
-        self._idle_controlword = _NO_CONTROLWORD
-        self._events.append(PowerStateChanged(now_ns, self.node_id, before, state, self.number))
-        was_powered = self.is_powered
-        self.power(
-            state is PowerState.OPERATION_ENABLED
-            or (was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE})
-        )
-        if not self.is_powered or not was_powered:
-            self.demand.hold(float(self.shaft_counts))
-            self.position_demand_counts = float(self.shaft_counts)
-            self._following_error_since_ns = None
-        if before is PowerState.FAULT or state is PowerState.OPERATION_ENABLED:
-            self.internal_bits = 0
-        self._activate(now_ns)
-        self._sampled_at_ns = -1
-        self.show_status()
-
-    def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
-        """Raise an error that leads to a fault: EMCY at once, then the fault reaction 605Eh, then the state fault.
-
-        ``persists``: no fault reset is accepted until ``end_warning`` is called. An axis without supply notices nothing
-        but a cause that persists, once it has one again.
-        """
-        if self.is_switched_off:
-            if persists:
-                self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=True)
-            return
-        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=True, persists=persists)
-        if self._state in {PowerState.FAULT_REACTION_ACTIVE, PowerState.FAULT}:
-            return
-        if self.is_powered:
-            ramp = self._option(objects.FAULT_REACTION_OPTION_CODE)
-            if ramp is StopRamp.NONE:
-                self.power(False)
-            elif self._state is PowerState.OPERATION_ENABLED:
-                self._stop(ramp, now_ns)
-        self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)
-
-    def warn(self, error_code: int, register_bits: int, now_ns: int) -> None:
-        """Raise an error that leads to no fault: EMCY alone."""
-        self._errors.raise_error(error_code, register_bits, now_ns, is_fault=False, persists=False)
-
-    def end_warning(self, error_code: int, now_ns: int) -> None:
-        """The cause of an error is gone; a fault that it has led to is still to be reset."""
-        self._errors.end_cause(error_code, now_ns)
-
     # -- modes ---------------------------------------------------------------------------------------------------
+
+    def _tell_mode(self, controlword: int, now_ns: int) -> None:
+        active = self._active
+        if active is None:
+            return
+        active.on_controlword(controlword, now_ns)
+        is_halted = bool(controlword & _HALT)
+        if is_halted is not self.is_halted and self._active is active:
+            self.is_halted = is_halted
+            if is_halted:
+                active.halt(now_ns)
+            else:
+                active.resume(now_ns)
+            self.show_status()
 
     def _on_mode(self, value: int, now_ns: int) -> AbortCode | None:
         return None if value in MODES else AbortCode.VALUE_RANGE_EXCEEDED
@@ -574,7 +398,7 @@ class Axis(MeasuredMotion):
 
     def _switch_mode(self, now_ns: int) -> None:
         self._mode = MODES[self._mode_entry.value]
-        self._idle_controlword = _NO_CONTROLWORD
+        self._idle_controlword = NO_CONTROLWORD
         self.internal_bits &= ~_LIMITED
         self._activate(now_ns)
         self.show_status()
