@@ -1,7 +1,7 @@
 """A gateway and an emulated machine that fails on command, in virtual time, and what the linkage went through."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,6 +18,7 @@ from gateway.cyclic.guard import GuardTripped, StopReason
 from gateway.record.sample import Phase
 from gateway.running.assembly import build_core
 from gateway.running.core import GatewayCore
+from gateway.running.machine_session import StepReached
 from gateway.running.preparation import PreparedRun, prepare
 from mechanism.dynamics import inverse_dynamics_along
 from sim_drive.assembly import build_machine
@@ -133,8 +134,25 @@ class Guarded:
         return {Phase(int(sample[12])) for sample in self.samples}
 
     @property
+    def place(self) -> tuple[str, Phase]:
+        """Where the session is now: its step, and what the cycle demands."""
+        steps = [event.step for event in self.events if isinstance(event, StepReached)]
+        return steps[-1] if steps else "", self.core.loop.phase
+
+    @property
     def is_without_torque(self) -> bool:
         return not any(drive.is_powered for drive in self.machine.drives)
+
+    def master_peaks(self, phase: Phase) -> tuple[float, float]:
+        """Peaks of the master's demanded acceleration (rad/s^2) and jerk (rad/s^3) in a phase, either way."""
+        cycle_s = self.config.bus.cycle_us * 1e-6
+        velocities = np.array([sample[3] for sample in self.samples])
+        is_in = np.array([int(sample[12]) == phase for sample in self.samples])
+        acceleration = np.diff(velocities) / cycle_s
+        jerk = np.diff(acceleration) / cycle_s
+        # From the phase before this one, and into the one after it, as well.
+        around = is_in[1:] | is_in[:-1]
+        return float(np.abs(acceleration[around]).max()), float(np.abs(jerk[around[1:] | around[:-1]]).max())
 
     def strain(self, from_s: float, to_s: float = math.inf) -> Strain:
         """What the linkage went through between two instants."""
@@ -193,6 +211,82 @@ class Host:
     def _be_late(self, now_ns: int) -> None:
         if self.late[0] <= now_ns < self.late[1]:
             self.core.loop.sent(now_ns + self.core.loop.period_ns)
+
+
+class OverTorque:
+    """Has a drive's TPDOs tell of more torque than there is, for a span; the host hears it, the drive does nothing."""
+
+    def __init__(self, core: GatewayCore, node: int, at_s: float, for_s: float, permille: int = 3000) -> None:
+        self.core = core
+        self.cob_id = 0x180 + node
+        self.from_ns, self.until_ns = round(at_s * SECOND), round((at_s + for_s) * SECOND)
+        self.torque = permille.to_bytes(2, "little", signed=True)
+        self.next_wake_ns = core.next_wake_ns
+        self.wake = core.wake
+        self.take_frames = core.take_frames
+        self.take_events = core.take_events
+
+    def receive(self, frame: Frame, now_ns: int) -> None:
+        if frame.cob_id == self.cob_id and self.from_ns <= now_ns < self.until_ns:
+            frame = Frame(frame.cob_id, frame.data[:6] + self.torque)
+        self.core.receive(frame, now_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """An instant of a run, and where the session then is: see ``Guarded.place``."""
+
+    at_s: float
+    step: str
+    phase: Phase
+
+
+@lru_cache(maxsize=1)
+def moments() -> Mapping[str, Moment]:
+    """Instants all over a run of the paper's machine, from one that nothing disturbs."""
+    run = Guarded().to_end()
+    steps = {event.step: event.at_ns / SECOND for event in run.events if isinstance(event, StepReached)}
+    at_s = np.array([sample[1] for sample in run.samples]) / SECOND
+    phases = np.array([sample[12] for sample in run.samples])
+    theta2 = np.degrees([sample[2] for sample in run.samples]) % 360.0
+
+    def begin(phase: Phase, which: int = 0) -> float:
+        return float(at_s[np.flatnonzero(np.diff(phases, prepend=-1.0) * (phases == phase))[which]])
+
+    def at_angle(degrees: float) -> float:
+        return float(at_s[np.flatnonzero((phases == Phase.CAM) & (np.abs(theta2 - degrees) < 0.5))[0]])
+
+    homing, enabling = steps["homing axis servo"], steps["enabling the axes"]
+    standstill, end = begin(Phase.STANDSTILL), begin(Phase.STANDSTILL, 1)
+    ramp_up, cam, ramp_down = begin(Phase.RAMP_UP), begin(Phase.CAM), begin(Phase.RAMP_DOWN)
+    return {
+        "commissioning": Moment(0.5 * steps["starting the cycle"], "commissioning", Phase.COMMISSIONING),
+        "homing": Moment(0.5 * (homing + enabling), "homing axis servo", Phase.COMMISSIONING),
+        "enabling": Moment(0.5 * (enabling + standstill), "enabling the axes", Phase.COMMISSIONING),
+        "standstill": Moment(0.5 * (standstill + ramp_up), "enabling the axes", Phase.STANDSTILL),
+        "slow ramp up": Moment(ramp_up + 0.15, "moving", Phase.RAMP_UP),
+        "fast ramp up": Moment(cam - 0.1, "moving", Phase.RAMP_UP),
+        "cam": Moment(at_angle(100.0), "moving", Phase.CAM),
+        "cam, farther": Moment(at_angle(230.0), "moving", Phase.CAM),
+        "return stroke": Moment(at_angle(325.0), "moving", Phase.CAM),
+        "fast ramp down": Moment(ramp_down + 0.25, "moving", Phase.RAMP_DOWN),
+        "slow ramp down": Moment(end - 0.15, "moving", Phase.RAMP_DOWN),
+        "end": Moment(end + 0.05, "moving", Phase.STANDSTILL),
+    }
+
+
+BEFORE_MOTION = ("commissioning", "homing", "enabling", "standstill")
+IN_MOTION = (
+    "slow ramp up",
+    "fast ramp up",
+    "cam",
+    "cam, farther",
+    "return stroke",
+    "fast ramp down",
+    "slow ramp down",
+)
+MOMENTS = (*BEFORE_MOTION, *IN_MOTION, "end")
+"""Names of ``moments``."""
 
 
 def shaft_torques(angles: np.ndarray, tick_s: float, config: GatewayConfig) -> tuple[float, float]:
