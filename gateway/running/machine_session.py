@@ -210,25 +210,34 @@ class MachineSession:
     def _enable_all(self) -> Procedure[None]:
         self._step("enabling the axes")
         yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), _cyclic_mode(node)))
-        master, slave = (axis.channel.actual for axis in self.axes)
-        targets = self.demand.align(self.plan.at(0.0)[0], (master, slave))
-        problems: list[str] = []
-        for axis, target in zip(self.axes, targets, strict=True):
-            window = axis.channel.units.counts_in(START_WINDOW_RAD)
-            if abs(axis.channel.actual - target) > window:
-                problems.append(
-                    f"axis {axis.node.name}: stands at {axis.channel.actual} counts, the cam starts at {target}, "
-                    f"which is more than {window} counts away; bring the linkage to its home position, or start from "
-                    "where it stands (--from-here)"
-                )
+        problems = self._away_from_start([axis.channel.actual for axis in self.axes])
         if problems and self._approach is not None:
             self._way = self._find_way(self._approach)
         elif problems:
             raise CommissioningError(problems)
         # Until now the target of each axis was its actual position; from here on it is held where it then is.
         yield from for_all(self._nodes, lambda node: self.power.enable(self._axis(node)))
+        # An axis is held where it, or its resolver, has come to meanwhile: that may not be where it was.
+        problems = [] if self._way else self._away_from_start([axis.channel.target for axis in self.axes])
+        if problems:
+            raise CommissioningError(problems)
         self.loop.is_guarding_enabled = True
         self.loop.phase = Phase.STANDSTILL
+
+    def _away_from_start(self, positions: list[int]) -> list[str]:
+        """A sentence for each axis that stands, at these counts, too far from where the plan begins."""
+        master, slave = positions
+        targets = self.demand.align(self.plan.at(0.0)[0], (master, slave))
+        problems: list[str] = []
+        for axis, position, target in zip(self.axes, positions, targets, strict=True):
+            window = axis.channel.units.counts_in(START_WINDOW_RAD)
+            if abs(position - target) > window:
+                problems.append(
+                    f"axis {axis.node.name}: stands at {position} counts, the cam starts at {target}, "
+                    f"which is more than {window} counts away; bring the linkage to its home position, or start from "
+                    "where it stands (--from-here)"
+                )
+        return problems
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.
@@ -247,12 +256,15 @@ class MachineSession:
                     loop.controlled_stop()
                 yield self.master.now_ns + NS_PER_S
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self.is_stop_requested else StopReason.COMPLETED)
+        if loop.phase is not Phase.QUICK_STOP:
+            yield from self.master.pause(SETTLE_S)
+            # Guarded until the end; but a wish to stop that comes now finds the run completed.
+            if guard.stopped_by not in {None, StopReason.OPERATOR}:
+                self.stopped_by = guard.stopped_by
         if self.stopped_by is StopReason.COMPLETED and not demand.law.is_plain:
             self._step("the slave ends off its cam: give the next run --from-here")
         if loop.phase is Phase.QUICK_STOP:
             self._step("quick stop")
-        else:
-            yield from self.master.pause(SETTLE_S)
 
     def may_move(self) -> bool:
         """Whether nothing has called for a stop."""

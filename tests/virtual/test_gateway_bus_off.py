@@ -4,8 +4,7 @@ import itertools
 import math
 
 import pytest
-from guarded_machine import CV, PAPER, SERVO, Guarded, changed
-from test_guard_conditions import MOTION, PHASE_AT_S, QUICK_BOUND_RAD
+from guarded_machine import CV, IN_MOTION, PAPER, SERVO, Guarded, changed, moments
 
 from config.guard_section import Reaction
 from drivers.cia402 import State, state_of
@@ -18,11 +17,24 @@ from gateway.running.event_text import describe
 from gateway.running.recovery import AxisRecovered
 
 MS = 1_000_000
-PHASES = {"before the first answer": 0.0005, **PHASE_AT_S}
+AT_S = {"before the first answer": 0.0005, "return stroke": 2.71}
+"""Beside ``moments``, whose return stroke is at another angle."""
+PHASES = (
+    "before the first answer",
+    "commissioning",
+    "homing",
+    "enabling",
+    "standstill",
+    "fast ramp up",
+    "cam",
+    "return stroke",
+    "fast ramp down",
+)
 SPANS_S = (0.003, 0.010, 0.030, 0.060, 0.150, 0.500)
 """Shorter and longer than what the drives wait for: 40 ms for SYNC, 200 ms for the gateway's heartbeat."""
 LEAST_SINE = 0.79
 BOUND_CAM_RAD = math.radians(6.0)
+QUICK_BOUND_RAD = math.radians(20.0)
 
 GIVEN_UP_TEXT = "the gateway's CAN controller has been bus-off for 5 s and is not back"
 
@@ -30,6 +42,10 @@ GIVEN_UP_TEXT = "the gateway's CAN controller has been bus-off for 5 s and is no
 def reacting(reaction):
     rule = "bus_off: {persistence_cycles: 30, reaction: "
     return changed((rule + Reaction.QUICK_STOP.value, rule + reaction.value))
+
+
+def instant(phase):
+    return AT_S[phase] if phase in AT_S else moments()[phase].at_s
 
 
 class Outage:
@@ -60,7 +76,7 @@ class Outage:
         assert strain.least_sine > LEAST_SINE
         assert strain.cam_distance_rad < BOUND_CAM_RAD
         assert run.trips[0].condition is Condition.BUS_OFF
-        if phase in MOTION:
+        if phase in IN_MOTION:
             assert run.core.failure is None
             phases = [Phase(int(sample[12])) for sample in run.samples]
             after = set(phases[phases.index(Phase.QUICK_STOP) :])
@@ -78,7 +94,7 @@ class Outage:
 
 
 def check(phase, for_s):
-    outage = Outage(PHASES[phase], for_s)
+    outage = Outage(instant(phase), for_s)
     outage.assert_stopped_in_order(phase)
     # A frame that was being sent when the controller went off is on the wire; nothing after it is.
     assert not outage.sent_by_gateway(outage.at_ns + MS, outage.back_ns)
@@ -111,7 +127,7 @@ def test_an_outage_of_any_length_in_any_phase_ends_the_run_in_order(phase, for_s
 )
 def test_the_first_demand_after_the_return_is_where_the_drives_were_left(reaction, offset_s):
     """No target that the drives see is farther from the one before than the cam makes it in a cycle."""
-    outage = Outage(PHASES["return stroke"] + offset_s, 0.0107, reacting(reaction))
+    outage = Outage(instant("return stroke") + offset_s, 0.0107, reacting(reaction))
     assert outage.run.stopped_by is StopReason.BUS_OFF
     for node, bound in ((CV, 9), (SERVO, 15)):
         demands = [(at_ns, frame) for at_ns, frame in outage.frames if frame.cob_id == 0x200 + node]
@@ -125,7 +141,7 @@ def test_the_first_demand_after_the_return_is_where_the_drives_were_left(reactio
 
 
 def test_the_outage_is_told_recorded_and_counted():
-    outage = Outage(PHASES["cam"], 0.06)
+    outage = Outage(instant("cam"), 0.06)
     run = outage.run
     changes = [event for event in run.events if isinstance(event, ControllerChanged)]
     assert [change.state for change in changes] == [ErrorState.OFF, ErrorState.ACTIVE]
@@ -143,7 +159,7 @@ def test_the_outage_is_told_recorded_and_counted():
     "phase", ["cam", *(pytest.param(name, marks=pytest.mark.slow) for name in PHASES if name != "cam")]
 )
 def test_a_controller_that_stays_away_is_given_up(phase):
-    outage = Outage(PHASES[phase], None)
+    outage = Outage(instant(phase), None)
     run = outage.run
     assert (run.stopped_by, str(run.core.failure)) == (StopReason.BUS_LOST, GIVEN_UP_TEXT)
     assert run.core.is_done
@@ -157,11 +173,11 @@ def test_a_controller_that_stays_away_is_given_up(phase):
 @pytest.mark.parametrize("reaction", [Reaction.CONTROLLED_STOP, Reaction.DISABLE])
 @pytest.mark.parametrize("for_s", [0.010, 0.150, None])
 def test_the_table_says_what_is_done(reaction, for_s):
-    run = Outage(PHASES["return stroke"], for_s, reacting(reaction)).run
+    run = Outage(instant("return stroke"), for_s, reacting(reaction)).run
     assert run.stopped_by is (StopReason.BUS_LOST if for_s is None else StopReason.BUS_OFF)
     assert not run.is_torn
     assert run.is_without_torque
-    assert run.strain(PHASES["return stroke"]).cam_distance_rad < QUICK_BOUND_RAD
+    assert run.strain(instant("return stroke")).cam_distance_rad < QUICK_BOUND_RAD
     if for_s == 0.010 and reaction is Reaction.CONTROLLED_STOP:
         assert {Phase.CONTROLLED_STOP, Phase.QUICK_STOP} & run.phases == {Phase.CONTROLLED_STOP}
 
@@ -169,7 +185,7 @@ def test_the_table_says_what_is_done(reaction, for_s):
 @pytest.mark.slow
 @pytest.mark.parametrize("again_s", [0.005, 0.060, 0.105, 0.2])
 def test_a_controller_that_goes_off_again_while_the_axes_are_recovered_still_ends_the_run(again_s):
-    at_s = PHASES["cam"]
+    at_s = instant("cam")
     second_ns = round((at_s + 0.15 + again_s) * 1e9)
     run = Outage(at_s, 0.15, second=[(second_ns, second_ns + 300 * MS)]).run
     assert run.core.is_done

@@ -3,9 +3,8 @@
 import itertools
 
 import pytest
-from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2
+from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2, moments
 from test_approach_from_anywhere import Again
-from test_guard_conditions import MOTION, PHASE_AT_S
 
 from drivers.cia402 import State, state_of
 from drivers.master import BootUpReceived, EmergencyReceived
@@ -111,12 +110,12 @@ LOSSES = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("phase", MOTION)
+@pytest.mark.parametrize("phase", ["fast ramp up", "cam", "return stroke", "fast ramp down"])
 @pytest.mark.parametrize(("node", "name", "other"), [(CV, "cv", "servo"), (SERVO, "servo", "cv")])
 @pytest.mark.parametrize("kind", LOSSES)
 def test_either_axis_may_be_lost_in_any_phase(kind, node, name, other, phase):
     for_s, reason, text = LOSSES[kind]
-    at_s = PHASE_AT_S[phase]
+    at_s = moments()[phase].at_s
     frames = []
     run = Guarded(Fault(kind, node, at_s, for_s), trace=lambda at_ns, frame: frames.append((at_ns, frame))).to_end()
     frames = [(at_ns, frame) for at_ns, frame in frames if at_ns >= at_s * 1e9]
@@ -134,9 +133,9 @@ def test_either_axis_may_be_lost_in_any_phase(kind, node, name, other, phase):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [FaultKind.POWER_CYCLE, FaultKind.NODE_RESET, FaultKind.BUS_OFF])
 @pytest.mark.parametrize(("node", "name"), [(CV, "cv"), (SERVO, "servo")])
-@pytest.mark.parametrize("phase", ["commissioning", "enabling"])
+@pytest.mark.parametrize("phase", ["commissioning", "homing"])
 def test_an_axis_that_is_lost_before_the_motion_ends_the_run_without_any(kind, node, name, phase):
-    run = Guarded(Fault(kind, node, PHASE_AT_S[phase], LOSSES[kind][0])).to_end()
+    run = Guarded(Fault(kind, node, moments()[phase].at_s, LOSSES[kind][0])).to_end()
     assert run.stopped_by is StopReason.COMMISSIONING
     assert f"axis {name}: node {node}" in str(run.core.failure)
     assert run.phases <= {Phase.COMMISSIONING, Phase.DISABLED}
