@@ -304,7 +304,6 @@ def test_no_condition_is_left_out():
 
 SAMPLE = {
     (Condition.CAM_WINDOW, MACHINE, "return stroke"),
-    (Condition.OPERATOR_STOP, MACHINE, "return stroke"),
     (Condition.MISSED_DEADLINE, MACHINE, "homing"),
     (Condition.SYNC_LOST, MACHINE, "fast ramp down"),
     (Condition.EMERGENCY, SERVO, "standstill"),
