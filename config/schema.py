@@ -210,7 +210,9 @@ class BusSection(Model):
     sync_source: SyncSource = SyncSource.AUTO
     timestamps: Timestamps = Timestamps.AUTO
     trace_lateness: bool = False
-    """Tell, in the run's events, why cycles were late: processor taken away, stolen by the host, page faults."""
+    """Tell, in the run's events, of every late wake: processor taken away, stolen by the host, page faults.
+
+    Why deadlines were missed is in every report without it."""
     processor: Annotated[int, Field(ge=0, le=4095)] | None = None
     """Processor that the cyclic loop is bound to; null: an isolated one if there is one, else none."""
     gateway_node_id: Annotated[int, Field(ge=1, le=MAX_NODE_ID)] = 127

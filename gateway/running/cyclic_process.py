@@ -221,12 +221,17 @@ def late_accountant(config: GatewayConfig, bus: CycleBus, ring: RingWriter) -> L
     def trace(text: str, figures: dict[str, int]) -> None:
         ring.append_event(time.monotonic_ns(), "late", text, source="gateway", **figures)
 
+    is_fine, counters = is_processor_clock_fine(), open_counters()
+    if counters is None or not is_fine:
+        why = "goes in steps too large" if not is_fine else "leaves out waiting for a processor"
+        text = f"account of processor time off: this kernel's {why}; of lateness only what passed asleep is explained"
+        ring.append_event(time.monotonic_ns(), "realtime", text, is_on=False)
     return LateAccountant(
         period_ns,
         tell,
         is_echoed=bus.echo_cob_id is not None,
-        is_fine=is_processor_clock_fine(),
-        counters=open_counters(),
+        is_fine=is_fine,
+        counters=counters,
         trace=WakeTrace(period_ns, trace) if config.bus.trace_lateness else None,
     )
 
