@@ -135,6 +135,13 @@ class Excess:
     theta2: float
 
     @property
+    def share(self) -> float:
+        """By what factor the limit is passed."""
+        if self.what is Strained.SINE:
+            return self.limit / max(self.value, 1e-9)
+        return self.value / self.limit
+
+    @property
     def bound(self) -> str:
         """The limit itself."""
         if self.what is Strained.SINE:

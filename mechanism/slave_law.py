@@ -217,7 +217,7 @@ class SlaveLaw:
         proof = self._need_proof()
         self._refuse_engagement(is_engaged)
         start = at % tau
-        first: Excess | None = None
+        mildest: tuple[Excess, float] | None = None
         fitting: LawState | None = None
         for width, margin in _windows(window):
             state = self._engagement(is_engaged, start, width)
@@ -229,10 +229,10 @@ class SlaveLaw:
             if excess is None:
                 fitting = state
                 break
-            if margin == GRID_MARGIN:
-                first = first or excess
-        if fitting is None or (window and first is not None):
-            raise EngagementError(is_engaged, start, window, speed, first, fitting)
+            if margin == GRID_MARGIN and (mildest is None or (not window and excess.share < mildest[0].share)):
+                mildest = excess, width
+        if fitting is None or (window and mildest is not None):
+            raise EngagementError(is_engaged, start, window, speed, mildest, fitting)
         return Engagement(is_engaged, fitting, speed)
 
     def engage(self, engagement: "Engagement", theta2: float) -> None:
@@ -320,11 +320,13 @@ class EngagementError(MotionError):
         start: float,
         window: float,
         speed: float,
-        excess: Excess | None,
+        refused: tuple[Excess, float] | None,
         fitting: LawState | None,
     ) -> None:
+        """``refused``: what is in the way of the window that was asked for, or of the best of all, and its width."""
         what = "returning to" if is_engaged else "leaving"
-        width = f"{degrees(window):.4g} deg" if window else "any window"
+        excess, width_rad = refused or ("", window)
+        width = f"{degrees(window):.4g} deg" if window else f"any window, {degrees(width_rad):.0f} deg being the best,"
         wider = "no wider window fits" if fitting is None else f"{degrees(fitting.end - start):.0f} deg would fit"
         super().__init__(
             f"{what} the cam at {degrees(start):.4g} deg within {width} at {speed * 60.0 / tau:.4g} rpm: {excess}"

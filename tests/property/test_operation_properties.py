@@ -310,3 +310,21 @@ def test_a_shift_of_a_machine_that_waits_is_shown_and_guarded_as_motion():
     machine.go(0.01)
     assert machine.demand.phase is Phase.STANDSTILL
     assert machine.law.shift == pytest.approx(math.radians(3.0))
+
+
+def test_where_no_window_does_the_best_one_says_why():
+    """With its slave parked the master may go faster than the cam allows; there is no way back until it is slower."""
+    machine = Operated().to_speed()
+    assert machine.order(Order.DISENGAGE, 100.0) == ""
+    machine.until(lambda: not math.isfinite(machine.law._window[0]))
+    assert machine.order(Order.OVERRIDE, 200.0) == ""
+    machine.go(1.5)
+    sentence = machine.order(Order.ENGAGE, 100.0)
+    assert sentence.startswith("returning to the cam at 100 deg within any window, ")
+    assert " deg being the best, at 120 rpm: axis servo's " in sentence
+    assert machine.order(Order.OVERRIDE, 100.0) == ""
+    machine.go(1.5)
+    assert machine.order(Order.ENGAGE, 100.0) == ""
+    machine.go(2.0)
+    assert machine.law.is_plain
+    machine.assert_limits_were_kept()
