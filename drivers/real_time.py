@@ -129,7 +129,7 @@ def try_realtime(priority: int = 80, processor: int | None = None) -> list[RealT
         _try_fifo(priority),
         _try_lock_memory(),
         _try_processor(processor),
-        _try_short_idle(),
+        short_idle(),
         freeze_garbage(),
     ]
 
@@ -158,7 +158,7 @@ def _try_processor(processor: int | None) -> RealTimeSetting:
     return RealTimeSetting(feature, True, f"processor {chosen}{shared}")
 
 
-def _try_short_idle(device: Path = Path("/dev/cpu_dma_latency")) -> RealTimeSetting:
+def short_idle(device: Path = Path("/dev/cpu_dma_latency")) -> RealTimeSetting:
     """Ask for a wake-up latency of 0 us; the request lasts as long as the file is open, so as this process."""
     feature = RealTimeFeature.IDLE_LATENCY
     try:

@@ -1,14 +1,17 @@
 """The doctor on machines that are folders, and on the one that runs the tests."""
 
+import ctypes
 import json
 
 import pytest
 from typer.testing import CliRunner
 
+from drivers.real_time import RealTimeFeature, RealTimeSetting
 from gateway.cli.app import app
 from gateway.running import doctor
 from gateway.running.doctor import Topic, Verdict, Wanted, can_findings, examine, findings_json, host_findings, is_ready
 
+PR_GET_TIMERSLACK = 30
 GOOD_CAN = {
     "ifname": "can0",
     "linkinfo": {
@@ -94,6 +97,34 @@ def test_an_ordinary_machine_is_given_a_remedy_for_each(tmp_path, monkeypatch):
     assert is_ready(host_findings(tmp_path)), "advice is no reason not to run"
 
 
+def test_a_timer_slack_that_the_loop_may_not_change_is_told(tmp_path, monkeypatch):
+    write(tmp_path, proc__self__timerslack_ns="50000")
+    before = ctypes.CDLL(None).prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    good = by_topic(host_findings(tmp_path))[Topic.TIMER_SLACK]
+    assert (good.verdict, good.found) == (
+        Verdict.GOOD,
+        "50000 ns for this process; the loop sets 1 ns for itself",
+    )
+    assert ctypes.CDLL(None).prctl(PR_GET_TIMERSLACK, 0, 0, 0, 0) == before, "looking changes nothing"
+    refused = RealTimeSetting(RealTimeFeature.TIMER_SLACK, False, "Operation not permitted")
+    monkeypatch.setattr(doctor, "tighten_timers", lambda: refused)
+    bad = by_topic(host_findings(tmp_path))[Topic.TIMER_SLACK]
+    assert (bad.verdict, bad.found) == (
+        Verdict.ADVICE,
+        "50000 ns for this process; the loop cannot change it (Operation not permitted)",
+    )
+    assert "PR_SET_TIMERSLACK" in bad.remedy
+
+
+def test_whatever_is_not_good_has_a_remedy(tmp_path):
+    interface(tmp_path, "can0", flags="0x40080", queue="10")
+    for link in ([], [{"ifname": "can0", "linkinfo": {"info_kind": "can", "info_data": {"state": "STOPPED"}}}]):
+        findings = examine(Wanted("can0", 1_000_000), tmp_path, lambda link=link: link)
+        assert [
+            finding.topic for finding in findings if finding.verdict is not Verdict.GOOD and not finding.remedy
+        ] == []
+
+
 def test_a_good_can_interface(tmp_path):
     interface(tmp_path, "can0")
     found = can(tmp_path, GOOD_CAN, Wanted("can0", 1_000_000))
@@ -136,6 +167,8 @@ def test_hardware_stamps_and_a_gateway_that_restarts_its_controller_are_told(tmp
         ({"bittiming": {"bitrate": 0}}, Topic.BIT_RATE, Verdict.PROBLEM, "not set", "bitrate 1000000"),
         ({"bittiming": {"bitrate": 1000000, "sample_point": "0.750"}}, Topic.SAMPLE_POINT, Verdict.ADVICE, "75.0%",
          "sample-point 0.875"),
+        ({"bittiming": {"bitrate": 1000000}}, Topic.SAMPLE_POINT, Verdict.ADVICE,
+         "unknown: the driver does not tell it", "samples at 87.5 %"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_with_a_can_interface(tmp_path, change, topic, verdict, found, remedy):

@@ -1,16 +1,28 @@
 """The real-time host on a port and a clock that are not real, and what it asks of the system."""
 
 import ctypes
+import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from host_nodes import PeriodicNode, ScriptedNode
 
 from drivers.errors import BusError
 from drivers.frame import Frame
-from drivers.real_time import MAX_WAIT_S, RETRY_S, RealTimeFeature, run_node, tighten_timers
+from drivers.real_time import (
+    MAX_WAIT_S,
+    RETRY_S,
+    RealTimeFeature,
+    RealTimeSetting,
+    run_node,
+    short_idle,
+    tighten_timers,
+)
 
 SYNC = Frame(0x080)
 
@@ -106,18 +118,81 @@ def test_timer_slack_is_what_the_kernel_says() -> None:
     assert setting.is_on == (slack_ns == 1)
 
 
-def test_what_the_system_lends_is_reported_and_never_raised() -> None:
-    """In a process of its own: SCHED_FIFO and locked memory are not for the test runner."""
-    program = (
-        "from drivers.real_time import try_realtime\n"
-        "for priority in (1, 1000):\n"
-        "    print(*(f'{s.feature.name}={s.is_on}:{s.reason}' for s in try_realtime(priority)), sep='|')\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+HELPERS = Path(__file__).resolve().parents[1] / "helpers"
+
+
+def lent(priority: int = 1, *, unprivileged: bool = False) -> dict[str, Any]:
+    """What a process of its own has asked for and got."""
+    launcher = [sys.executable, str(HELPERS / "unprivileged.py")] if unprivileged else []
+    command = [*launcher, sys.executable, str(HELPERS / "real_time_effects.py"), str(priority)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == 0, done.stderr
-    permitted, impossible = (line.split("|") for line in done.stdout.splitlines())
-    features = [feature.name for feature in RealTimeFeature if feature is not RealTimeFeature.KERNEL_SYNC]
-    for settings in (permitted, impossible):
-        assert sorted(entry.partition("=")[0] for entry in settings) == sorted(features)
-        assert all(entry.partition(":")[2] for entry in settings)
-    assert impossible[1].startswith("SCHEDULING=False:")
+    found: dict[str, Any] = json.loads(done.stdout)
+    features = {feature.name for feature in RealTimeFeature}
+    assert found["settings"].keys() == features - {"KERNEL_SYNC", "HARDWARE_STAMPS"}
+    assert all(reason for _, reason in found["settings"].values())
+    return found
+
+
+def assert_true(found: dict[str, Any]) -> None:
+    """What is said to be on has its effect, and what is said to be off has none."""
+    is_on = {name: setting[0] for name, setting in found["settings"].items()}
+    assert (found["policy"] == os.SCHED_FIFO) is is_on["SCHEDULING"]
+    assert found["resets_on_fork"] is is_on["SCHEDULING"]
+    assert found["priority"] == (1 if is_on["SCHEDULING"] else 0)
+    assert found["locked_later"] is is_on["LOCKED_MEMORY"]
+    assert found["locked_share"] > 0.5 if is_on["LOCKED_MEMORY"] else found["locked_share"] == 0.0
+    assert is_on["FROZEN_GARBAGE"]
+    assert found["settings"]["FROZEN_GARBAGE"][1] == f"{found['frozen']} objects"
+    assert found["frozen"] > 1000
+    assert (found["affinity"] == [found["processor"]]) or not is_on["PROCESSOR"]
+    assert (found["idle_latency_us"] == 0) is is_on["IDLE_LATENCY"]
+    # A real-time thread has no slack at all, and later kernels say so.
+    assert (found["slack_ns"] in {0, 1}) is is_on["TIMER_SLACK"]
+
+
+def test_what_is_said_to_be_on_is_on() -> None:
+    assert_true(lent())
+
+
+def test_a_priority_that_does_not_exist_is_refused_and_the_rest_goes_on() -> None:
+    found = lent(1000)
+    assert found["settings"]["SCHEDULING"][0] is False
+    assert found["settings"]["SCHEDULING"][1].startswith(("priority 1000 refused", "not permitted"))
+    assert_true(found)
+
+
+def test_without_any_privilege_what_is_refused_is_off_and_the_reason_told() -> None:
+    found = lent(unprivileged=True)
+    assert found["capabilities"] == 0
+    assert_true(found)
+    settings = found["settings"]
+    assert settings["SCHEDULING"] == [False, "not permitted; it needs CAP_SYS_NICE or an rtprio limit"]
+    assert settings["LOCKED_MEMORY"] == [False, "not permitted; the memlock limit is 0 KiB"]
+    assert (found["policy"], found["locked_share"]) == (os.SCHED_OTHER, 0.0)
+    assert settings["TIMER_SLACK"] == [True, "1 ns"]
+
+
+def test_the_wake_up_latency_is_asked_for_as_long_as_the_process_lives(tmp_path: Path) -> None:
+    device = tmp_path / "cpu_dma_latency"
+    device.touch()
+    setting = short_idle(device)
+    descriptors = [int(link.name) for link in Path("/proc/self/fd").iterdir()]
+    held = [descriptor for descriptor in descriptors if is_open_on(descriptor, device)]
+    for descriptor in held:
+        os.close(descriptor)
+    assert setting == RealTimeSetting(RealTimeFeature.IDLE_LATENCY, True, "0 us")
+    assert (len(held), device.read_bytes()) == (1, bytes(4))
+
+
+def test_a_device_that_is_not_there_or_not_ours_is_told(tmp_path: Path) -> None:
+    device = tmp_path / "cpu_dma_latency"
+    assert short_idle(device) == RealTimeSetting(RealTimeFeature.IDLE_LATENCY, False, f"this kernel has no {device}")
+    assert short_idle(tmp_path) == RealTimeSetting(RealTimeFeature.IDLE_LATENCY, False, f"{tmp_path}: is a directory")
+
+
+def is_open_on(descriptor: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(descriptor), path.stat())
+    except OSError:
+        return False
