@@ -31,7 +31,7 @@ from mechanism.motion import MasterPlan, plan_stop
 FADE_RAD: Final = 0.1
 """Shift at which a feed-forward that knows the cam alone has faded out."""
 WINDOW_POINTS: Final = 2 * PASS_POINTS
-CAM_POINTS: Final = 64 * PASS_POINTS
+CAM_POINTS: Final = 32 * PASS_POINTS
 WINDOWS: Final = tuple(radians(window) for window in range(10, 361, 5))
 """Where none is asked for, the narrowest of these is taken that keeps away from all limits by ``EASE``, or else the
 narrowest that keeps them.
