@@ -32,6 +32,8 @@ _EXPECTED: Final = frozenset({"boot_up", "nmt_state"})
 """Part of every commissioning and of every good end, and news only while the machine is to move."""
 _NEWS_FROM: Final = frozenset({"moving", "approaching the cam"})
 _NEWS_UNTIL: Final = "done"
+_TOLD_STEPS: Final = frozenset({"quick stop", "recovering the axes"})
+"""Steps that only a run has that does not go as it should."""
 _SORTED_BY: Final = ("kind", "condition", "axis", "node_id", "object", "reaction")
 
 Print = Callable[[str, str], None]
@@ -67,7 +69,9 @@ class EventLines:
         self.tick(int(event.get("at_ns", self.now_ns)))
         if kind == "step":
             self._is_in_motion = text in _NEWS_FROM or (self._is_in_motion and text != _NEWS_UNTIL)
-            if self._with_steps:
+            if text in _TOLD_STEPS:
+                self._print(f"  {text}", "bold yellow")
+            elif self._with_steps:
                 self._print(text, "dim")
         elif kind == "failure":
             self._failures.append((self.now_ns, text))

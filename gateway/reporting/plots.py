@@ -392,8 +392,8 @@ def plots_of(data: RunData) -> tuple[Plot, ...]:
         Plot(
             "run",
             "The whole run",
-            "Master speed and following errors from the first movement to the last; red marks are cycles in which "
-            "a TPDO or a deadline was missed.",
+            "Master speed and following errors while the axes follow the cam, ramps and controlled stops included; "
+            "red marks are cycles in which a TPDO or a deadline was missed.",
             _run,
         ),
         Plot(

@@ -14,6 +14,7 @@ from gateway.reporting.number_text import number
 from gateway.reporting.plots import Plot, plots_of, to_png, to_svg
 from gateway.reporting.report_page import PAGE, STYLE
 from gateway.reporting.report_text import (
+    MOST_LINES,
     axis_rows,
     cycle_rows,
     headline,
@@ -62,6 +63,7 @@ def render_page(recording: Recording, data: RunData, report: RunReport, plots: t
         heading=escape(f"{report.constants.config_name}, axis errors"),
         subtitle=escape(headline(report).partition(": ")[2]),
         tiles=_tiles(report),
+        stopped=_what_stopped_it(report),
         axes=_axes_table(report),
         servo=figures["servo"] + figures["cv"],
         path=figures.get("path", "") + _table_ii(report),
@@ -101,16 +103,42 @@ def _tiles(report: RunReport) -> str:
     )
     cycle = report.cycle
     counts, missed = cycle.counts, cycle.counts.total
-    note = (
-        f"{number(counts.missed_tpdo)} TPDO, {number(counts.missed_rpdo_deadline)} deadline, "
-        f"{number(counts.overruns)} overrun, {number(counts.sync_lost)} SYNC; of {number(cycle.count)} cycles"
-    )
+    seen = [
+        f"{number(count)} {what}"
+        for count, what, is_always in (
+            (counts.missed_tpdo, "TPDO", True),
+            (counts.missed_rpdo_deadline, "deadline", True),
+            (counts.overruns, "overrun", True),
+            (counts.sync_lost, "SYNC", True),
+            (counts.bus_errors, "bus error", False),
+            (counts.send_buffer_full, "buffer full", False),
+        )
+        if count or is_always
+    ]
+    note = f"{', '.join(seen)}; of {number(cycle.count)} cycles"
     tiles.append(("missed in the cycle", number(missed), note, missed > 0))
     return "".join(
         f'<div class="tile{" bad" if bad else ""}"><span>{escape(what)}</span><strong>{escape(figure)}</strong>'
         f"<small>{escape(below)}</small></div>"
         for what, figure, below, bad in tiles
     )
+
+
+def _what_stopped_it(report: RunReport) -> str:
+    """The guard's trips, failures, and what became of the axes; nothing after a run that just completed."""
+    told = [event for event in report.decisive if event.kind != "end"]
+    if not told:
+        return ""
+    body = "".join(
+        _row(
+            [f"{event.at_s:.3f} s", event.kind.replace("_", " "), event.text],
+            classes=("left", "left bad" if event.is_alarming else "left"),
+        )
+        for event in told[:MOST_LINES]
+    )
+    more = f"<p>And {len(told) - MOST_LINES} more, see Events.</p>" if len(told) > MOST_LINES else ""
+    table = f'<div class="scroll"><table class="narrow"><tbody>{body}</tbody></table></div>'
+    return f"<h2>What stopped it, and what became of the machine</h2>{table}{more}"
 
 
 def _row(cells: list[str], tag: str = "td", classes: tuple[str, ...] = ()) -> str:

@@ -70,6 +70,7 @@ PAGE: Final = (
     PAGE_HEAD
     + """<header><h1>{heading}</h1><p>{subtitle}</p></header>
 <section class="tiles">{tiles}</section>
+{stopped}
 <h2>Axes at constant master speed</h2>
 {axes}
 {servo}

@@ -39,7 +39,8 @@ def describe(event: Event) -> tuple[str, str, EventData]:
             data: EventData = {"condition": condition.value, "axis": axis, "value": value, "limit": limit}
             return "guard", text, {**data, "reaction": reaction.value}
         case EmergencyReceived(_, node_id, code, register, vendor):
-            text = f"node {node_id} EMCY {code:04X}h, error register {register:02X}h"
+            cleared = " (cleared)" if code == 0 else ""
+            text = f"node {node_id} EMCY {code:04X}h{cleared}, error register {register:02X}h"
             return "emergency", text, {"node_id": node_id, "code": code, "vendor": vendor.hex()}
         case HeartbeatLost(_, node_id, timeout_s):
             return "heartbeat_lost", f"node {node_id}: no heartbeat for {timeout_s:g} s", {"node_id": node_id}

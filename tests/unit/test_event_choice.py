@@ -3,6 +3,7 @@
 import io
 import re
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -14,7 +15,7 @@ from gateway.record.recording import RecordingMetadata, RecordingWriter, read_re
 from gateway.record.ring import RunEvent
 from gateway.reporting.analysis import analyse
 from gateway.reporting.event_choice import LEAST_OTHERS, MOST_DECISIVE, MOST_SHOWN, choose_events, is_decisive
-from gateway.reporting.report import write_report
+from gateway.reporting.report import _what_stopped_it, write_report
 from gateway.reporting.report_text import render_report
 
 TRIP = {"kind": "guard", "condition": "torque", "axis": "servo", "reaction": "quick_stop", "text": "torque: too much"}
@@ -91,7 +92,7 @@ def stopped(tmp_path):
 def test_page_text_and_json_say_what_stopped_the_run(stopped, tmp_path, monkeypatch):
     monkeypatch.setattr("gateway.reporting.report.to_png", lambda _plot, _data: b"")
     html = write_report(stopped, tmp_path / "out")[0].read_text()
-    assert re.search(r'<td class="left bad">torque: too much</td>', html)
+    assert len(re.findall(r'<td class="left bad">torque: too much</td>', html)) == 2, "at the top, and among the events"
     assert "its reference is lost: bring it home" in html
     assert "Not shown here, and in the recording: 204 late." in html
     report = analyse(read_recording(stopped))
@@ -117,4 +118,7 @@ def test_a_stop_that_somebody_asked_for_is_no_alarm(tmp_path):
         for event in timed([wish, END]):
             writer.write_event(RunEvent(event))
         writer.close({"stopped_by": "operator"})
-    assert [event.is_alarming for event in analyse(read_recording(path)).decisive] == [False, False]
+    report = analyse(read_recording(path))
+    assert [event.is_alarming for event in report.decisive] == [False, False]
+    assert "sigint: on request" in _what_stopped_it(report)
+    assert _what_stopped_it(replace(report, decisive=report.decisive[-1:])) == "", "a run that completed has no stop"

@@ -125,4 +125,5 @@ def test_steps_are_told_where_no_progress_bar_shows_them():
     for with_steps in (True, False):
         terminal = Terminal(with_steps=with_steps)
         terminal.say("step", "homing axis cv")
-        assert terminal.lines == ["homing axis cv"] * with_steps
+        terminal.say("step", "quick stop")
+        assert terminal.lines == [*["homing axis cv"] * with_steps, "quick stop"]
