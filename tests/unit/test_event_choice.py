@@ -91,6 +91,7 @@ def stopped(tmp_path):
 
 def test_page_text_and_json_say_what_stopped_the_run(stopped, tmp_path, monkeypatch):
     monkeypatch.setattr("gateway.reporting.report.to_png", lambda _plot, _data: b"")
+    monkeypatch.setattr("gateway.reporting.report.to_svg", lambda _plot, _data: "")
     html = write_report(stopped, tmp_path / "out")[0].read_text()
     assert len(re.findall(r'<td class="left bad">torque: too much</td>', html)) == 2, "at the top, and among the events"
     assert "its reference is lost: bring it home" in html

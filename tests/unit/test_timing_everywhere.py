@@ -102,6 +102,7 @@ def json_figures(document):
 
 def test_in_the_text_the_page_and_the_json_of_a_report(samples, tmp_path, monkeypatch):
     monkeypatch.setattr("gateway.reporting.report.to_png", lambda _plot, _data: b"")
+    monkeypatch.setattr("gateway.reporting.report.to_svg", lambda _plot, _data: "")
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, RecordingMetadata(CONSTANTS, "", "")) as writer:
         writer.write_samples(samples)
