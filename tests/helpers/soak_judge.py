@@ -42,6 +42,8 @@ TRUTH_BOUND_COUNTS = 8
 BLIND = (FaultKind.FROZEN_RESOLVER, FaultKind.JUMPING_RESOLVER)
 RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
 NO_MOTION_YET = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL)
+SEEN = (*TRIPS, FaultKind.MUTE_HEARTBEAT, FaultKind.ERROR_PASSIVE, FaultKind.SLOW_SDO)
+"""Of the CV axis: it still tells where it is."""
 MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
 SLAVE_UNABLE = {Mischief.HOST_AWAY, Mischief.HOST_LATE, Mischief.CONTROLLER_OFF}
 """Nobody tells the slave, for a while, where the master is."""
@@ -105,7 +107,7 @@ class Judge:
         if Phase.QUICK_STOP not in self.phases:
             return "controlled"
         others = [p.what for p, _, _ in self.fired if not isinstance(p.what, Fault)]
-        is_able = all(fault.node_id == CV and fault.kind not in BLIND for fault, _ in self.faults)
+        is_able = all(fault.node_id == CV and fault.kind in SEEN for fault, _ in self.faults)
         return "quick" if is_able and not set(others) & SLAVE_UNABLE else "quick, slave unable"
 
     def _measure(self) -> Figures:
