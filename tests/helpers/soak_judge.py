@@ -26,6 +26,8 @@ QUICK_BOUND_DEG = 6.0
 LOST_BOUND_DEG = 20.0
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
+FROZEN_AT_REST_BOUND_DEG = 60.0
+"""A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
 """With orders, or on the way onto the cam, the demand itself comes nearer to a singular position; and so much more."""
@@ -39,9 +41,8 @@ TORQUE_OFF_AFTER_REST_S = 1.2
 KILLED_TORQUE_OFF_S = 0.6
 TORQUE_BOUND_NM = 10.0
 TRUTH_BOUND_COUNTS = 8
-BLIND = (FaultKind.FROZEN_RESOLVER, FaultKind.JUMPING_RESOLVER)
+AT_REST = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL, Moment.APPROACH, Moment.RAMP_UP, Moment.RAMP_DOWN)
 RESTARTS = (FaultKind.NODE_RESET, FaultKind.POWER_CYCLE)
-NO_MOTION_YET = (Moment.COMMISSIONING, Moment.ENABLING, Moment.STANDSTILL)
 SEEN = (*TRIPS, FaultKind.MUTE_HEARTBEAT, FaultKind.ERROR_PASSIVE, FaultKind.SLOW_SDO)
 """Of the CV axis: it still tells where it is."""
 MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
@@ -199,9 +200,9 @@ class Judge:
         if any(fault.kind is FaultKind.BROKEN_BRAKE for fault, _ in self.faults):
             # As soon as the drives are without torque, the axis falls.
             return "broken brake"
-        if any(fault.kind in BLIND and moment in NO_MOTION_YET for fault, moment in self.faults):
-            # An axis that stands, and whose resolver shows no more than that, sinks unseen.
-            return "blind before the motion"
+        if any(f.kind is FaultKind.JUMPING_RESOLVER and moment is Moment.ENABLING for f, moment in self.faults):
+            # Nobody has looked before: what the resolver then shows is where the axis is taken to be.
+            return "wrong from the start"
         return ""
 
     def _judge_outcome(self) -> None:
@@ -263,6 +264,8 @@ class Judge:
         if self.stop == "none":
             return
         lost = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
+        if any(f.kind is FaultKind.FROZEN_RESOLVER and moment in AT_REST for f, moment in self.faults):
+            lost = FROZEN_AT_REST_BOUND_DEG
         bound = {"controlled": CONTROLLED_BOUND_DEG, "quick": QUICK_BOUND_DEG}.get(self.stop, lost) + self._jumped_deg()
         if figures.cam_deg > bound:
             self._say(f"{figures.cam_deg:.1f} deg from the cam in a {self.stop} stop (bound {bound:.1f})")
