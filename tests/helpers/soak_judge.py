@@ -113,7 +113,7 @@ class Judge:
 
     def _measure(self) -> Figures:
         session, plant = self.session, self.rig.plant
-        angles = np.array(plant.angles)
+        angles = np.array(plant.ticks)
         times_ns = session.started_ns + np.arange(len(angles)) * TICK_S * SECOND
         parameters = plant.plant.parameters
         closure = parameters.closure
@@ -187,7 +187,7 @@ class Judge:
             self._say("the linkage is torn")
         if self.rig.is_powered:
             self._say("a drive has torque after the session")
-        angles = np.array(self.rig.plant.angles[-200:])
+        angles = np.array(self.rig.plant.ticks[-200:])
         if float(np.abs(angles - angles[-1]).max()) > TWO_COUNTS_RAD and not self.unheld:
             self._say("an axis moves after the session")
         started = [

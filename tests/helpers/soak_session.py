@@ -77,24 +77,29 @@ class WatchedPlant:
 
     def __init__(self, plant: Any) -> None:
         self.plant = plant
-        self.angles: list[tuple[float, float]] = []
-        self.angle, self.velocity, self.torque = plant.angle, plant.velocity, plant.torque
-        self.axis_energy, self.set_motion = plant.axis_energy, plant.set_motion
+        self.ticks: list[tuple[float, float]] = []
         self._advance: Callable[[Any, Any], None] = plant.advance
         self._friction = plant._settings[:, :2].copy()
+
+    def __getattr__(self, name: str) -> Any:
+        # Looked up once, save what changes with every tick.
+        value = getattr(self.plant, name)
+        if callable(value):
+            setattr(self, name, value)
+        return value
+
+    @property
+    def angles(self) -> Any:
+        return self.plant.angles
 
     @property
     def torn_at_s(self) -> float | None:
         return self.plant.torn_at_s
 
-    @property
-    def axis_count(self) -> int:
-        return self.plant.axis_count
-
     def advance(self, torques: Any, brakes: Any) -> None:
         self._advance(torques, brakes)
         values = self.plant.state
-        self.angles.append((values[0], values[1]))
+        self.ticks.append((values[0], values[1]))
 
     def drift(self, share: float) -> None:
         """Friction is so much more than it was."""
@@ -201,7 +206,7 @@ class Rig:
 
     def run(self, plan: SessionPlan) -> Session:
         """Carry out one session, and look on for a while."""
-        self.plant.angles.clear()
+        self.plant.ticks.clear()
         prepared = prepared_run(self.config.text)
         prepared = replace(prepared, plan=plan_of_run(self.config, plan.machine_cycles))
         session = Session(plan, prepared, self.now_ns, 0, self.is_ready, None)  # type: ignore[arg-type]
@@ -268,7 +273,7 @@ class Rig:
             turns = round(self.plant.angle(0) / math.tau) * math.tau
             self.plant.set_motion((turns, 0.0), (0.0, 0.0))
             self._look_on(None, 0.1)
-        self.plant.angles.clear()
+        self.plant.ticks.clear()
         return (self.now_ns - since_ns) / SECOND
 
     def _truth_error(self) -> int:
