@@ -64,7 +64,7 @@ def test_override_pause_and_jog_are_smooth_and_the_run_ends_at_home():
     assert [refusal[:20] for refusal in run.refusals] == ["", "", "a jog at 101 rpm is ", "", "", ""]
     assert_whole_and_home(run)
     assert_within_the_masters_limits(run)
-    assert run.strain(0.5).cam_distance_rad < math.radians(6.0)
+    assert run.strain(0.5).cam_distance_rad < math.radians(0.5)
 
 
 def actual_derivatives(run, smooth_ticks=16):
