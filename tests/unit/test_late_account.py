@@ -7,7 +7,8 @@ import pytest
 from config.loading import load_config
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
-from gateway.record.lateness import LATE_ACCOUNT_KIND, LATE_DEMAND_KIND, Cause, LateAccount, late_record
+from gateway.cyclic.lateness import Late
+from gateway.record.lateness import LATE_ACCOUNT_KIND, LATE_DEMAND_KIND, Cause, LateAccount, LateKind, late_record
 from gateway.record.ring import EVENT_MAX_BYTES, RingReader, RingWriter
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import SampleFlag
@@ -281,6 +282,80 @@ def test_what_was_taken_at_first_does_not_explain_what_is_late_for_good(prepared
     own = [demand for demand in world.explanations().worst if demand.cycle > 70 and demand.what.value[0] == "r"]
     assert len(own) > 10
     assert not any(demand.is_explained for demand in own)
+
+
+def test_a_call_that_waits_is_not_covered_by_a_processor_that_was_waited_for_before(prepared):
+    """1.5 ms ready before the wake, then 3 ms in a call: the demand of k+1 is some 2.9 ms late."""
+
+    def waited(world):
+        world.kernel.now_ns += 1500 * US
+        world.kernel.ready_ns += 1500 * US
+
+    # The sleep before cycle 70 belongs to 69.
+    disturb = {("asleep", 69): waited, ("awake", 70): lambda world: world.kernel.block(3 * MS)}
+    world = World(prepared, disturb=disturb)
+    told = {demand.cycle: dict(demand.shares_us) for demand in world.explanations().worst}
+    blamed = [shares for shares in told.values() if Cause.OWN_CALL in shares]
+    assert blamed
+    assert all(Cause.WOKEN_LATE not in shares or shares[Cause.WOKEN_LATE] < 20 for shares in blamed)
+
+
+def test_stamps_that_the_loops_own_lateness_has_changed_prove_nothing(prepared):
+    """It works for 1.2 ms in every cycle of 1 ms, and no processor clock tells: SYNCs then seem to come at once."""
+    disturb = {("awake", cycle): lambda world: world.kernel.work(1200 * US) for cycle in range(60, CYCLES)}
+    world = World(prepared, disturb=disturb, is_fine=False)
+    assert len(world.missed) > 10
+    shares = {cause for demand in world.explanations().worst for cause, span in demand.shares_us if span > 20}
+    assert Cause.SYNC_IRREGULAR not in shares
+
+
+class StubLoop:
+    cycle = 5
+    is_closed = False
+    processor_read_ns = 0
+
+
+def accountant(kernel, told):
+    late = LateAccountant(
+        MS,
+        lambda *event: told.append(event),
+        counters=kernel.counters,
+        processor_ns=lambda: kernel.processor_ns,
+        faults=lambda: 0,
+        clock=lambda: kernel.now_ns,
+    )
+    late.follow(StubLoop(), lambda: 300 * US)
+    return late
+
+
+def test_why_the_loops_own_sync_was_late_is_why_its_demand_was():
+    """SYNC, due at 2 ms, is sent at 2.75 after 0.7 ms of waiting for a processor; its demand, due at 3, at 3.3 ms."""
+    kernel, told = Kernel(), []
+    late = accountant(kernel, told)
+    late.rests(kernel.now_ns, 2 * MS)
+    kernel.block(MS)
+    kernel.take_away(700 * US)
+    late.woke(4, kernel.now_ns)
+    kernel.work(50 * US)
+    late.rests(kernel.now_ns, 3050 * US)
+    kernel.block(300 * US)
+    late.woke(5, kernel.now_ns)
+    kernel.work(250 * US)
+    late.missed(Late(LateKind.RPDO_DEADLINE, 5, 2750 * US, 3 * MS, 3300 * US, False, 750 * US, 2950 * US))
+    late.rests(kernel.now_ns, 4 * MS)
+    assert late.account.counts == {Cause.ANOTHER_PROCESS: 1}
+    assert late.account.not_explained == 0
+
+
+def test_of_thousands_at_once_the_worst_are_told():
+    kernel, told = Kernel(), []
+    late = accountant(kernel, told)
+    for number in range(3000):
+        late.missed(Late(LateKind.OVERRUN, number, 0, MS, MS + number * US, True, 0, None))
+    late.flush()
+    demands = [data for _, kind, _, data in told if kind == LATE_DEMAND_KIND]
+    assert sorted(data["missed_by_us"] for data in demands) == list(range(3000 - 64, 3000))
+    assert told[-1][3]["overruns"] == 3000
 
 
 def test_a_bus_that_takes_nothing_is_to_blame(prepared):

@@ -114,6 +114,17 @@ def test_a_wake_that_was_late_for_want_of_a_processor_is_not_counted_twice():
     assert sum(shares.values()) == 700 * US
 
 
+def test_a_wait_for_a_processor_before_the_wake_is_no_excuse_for_a_call_that_waits_after_it():
+    # Woke at 0.9 ms, 0.6 ms late for want of a processor; then a call of its own waited for 0.5 ms.
+    of_it = spell(1500, woke_us=900, ready_us=600, ready_at_wake_us=600, extra_switches=1)
+    found = told(of_it, 1500, replace(LATE, deadline_ns=600 * US, is_paced=False))
+    assert found.shares_ns == (
+        (Cause.ANOTHER_PROCESS, 600 * US),
+        (Cause.OWN_CALL, 300 * US),
+    )
+    assert found.cause is Cause.OWN_CALL
+
+
 def test_a_loop_that_computes_before_it_sleeps_is_not_woken_late():
     """Its sleep ends late because it began late: the processor time tells, or where that is coarse the clock."""
     assert told(spell(1400, woke_us=1300, processor_us=1100), 1400).cause is Cause.OWN_WORK
@@ -164,6 +175,7 @@ def test_a_loop_that_is_never_done_in_time_has_itself_to_blame():
 def test_a_sync_of_the_loops_own_is_no_excuse():
     own = replace(LATE, is_paced=False, deadline_ns=600 * US, deviation_ns=400 * US)
     busy = spell(1000, processor_us=700)
+    assert told(None, 1100, replace(LATE, is_paced=False, deviation_ns=-200 * US), 1100).cause is Cause.NOT_EXPLAINED
     assert told(busy, 1000, own).cause is Cause.NOT_EXPLAINED
     found = told(busy, 1000, own, carried=((Cause.ANOTHER_PROCESS, 400 * US),))
     assert (found.cause, found.is_explained) == (Cause.ANOTHER_PROCESS, True)
