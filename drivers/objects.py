@@ -93,6 +93,8 @@ TIME_OF_DAY: Final = 0x3030
 1984-01-01."""
 SET_POINT_WATCHDOG: Final = 0x3050
 """UNSIGNED16: interpolation times 60C2h without a set-point after which an enabled axis faults (8700h); 0 for none."""
+SET_POINT_AGE: Final = 0x3051
+"""UNSIGNED32, read only: how long (us) a cyclic mode's last set-point had acted when the axis lost its torque last."""
 
 # The areas of the object dictionary (CiA 301, table 40)
 COMMUNICATION_PROFILE_AREA: Final = range(0x1000, 0x2000)

@@ -243,6 +243,7 @@ class Axis(PowerDrive):
         self._limit_torque(*(entry.value for entry in self._torque_limits))
         self.set_period(self._interpolation_value.value, self._interpolation_exponent.value)
         self.set_watchdog(self._watchdog.value)
+        self.set_point_at_ns = 0
         self.demand.hold(float(self.shaft_counts))
         self.show_status()
 

@@ -27,6 +27,8 @@ _FAULT_RESET: Final = int(Controlword.FAULT_RESET)
 # Members of an enumeration by a name of the module's own: looking them up in their class costs a call's time.
 _OPERATION_ENABLED: Final = PowerState.OPERATION_ENABLED
 NO_CONTROLWORD: Final = -1
+_NS_PER_US: Final = 1_000
+_LONGEST_US: Final = 0xFFFFFFFF
 _OPTION_CODES: Final = {
     PowerState.SWITCHED_ON: objects.DISABLE_OPERATION_OPTION_CODE,
     PowerState.READY_TO_SWITCH_ON: objects.SHUTDOWN_OPTION_CODE,
@@ -46,6 +48,7 @@ class PowerDrive(MeasuredMotion):
         "_events",
         "_following_error_since_ns",
         "_idle_controlword",
+        "_set_point_age",
         "_state",
         "is_switched_off",
         "node_id",
@@ -74,6 +77,7 @@ class PowerDrive(MeasuredMotion):
         self._following_error_since_ns: int | None = None
         self.position_demand_counts = 0.0
         """Demand at the last servo tick, shaft frame."""
+        self._set_point_age = self.entry(objects.SET_POINT_AGE)
         self.is_switched_off = False
         """Without supply, as the drive has it."""
         self.controlword.on_write = self._on_controlword
@@ -188,6 +192,8 @@ class PowerDrive(MeasuredMotion):
             state is PowerState.OPERATION_ENABLED
             or (was_powered and state in {PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION_ACTIVE})
         )
+        if was_powered and not self.is_powered:
+            self._keep_set_point_age(now_ns)
         if not self.is_powered or not was_powered:
             self.demand.hold(float(self.shaft_counts))
             self.position_demand_counts = float(self.shaft_counts)
@@ -197,6 +203,11 @@ class PowerDrive(MeasuredMotion):
         self._activate(now_ns)
         self._sampled_at_ns = -1
         self.show_status()
+
+    def _keep_set_point_age(self, now_ns: int) -> None:
+        """For whoever asks how long the axis has had torque without a master; 0 where no set-point has ever come."""
+        age_us = (now_ns - self.set_point_at_ns) // _NS_PER_US if self.set_point_at_ns else 0
+        self._set_point_age.value = min(age_us, _LONGEST_US)
 
     def trip(self, error_code: int, register_bits: int, now_ns: int, *, persists: bool = False) -> None:
         """Raise an error that leads to a fault: EMCY at once, then the fault reaction 605Eh, then the state fault.
@@ -215,6 +226,7 @@ class PowerDrive(MeasuredMotion):
             ramp = self._option(objects.FAULT_REACTION_OPTION_CODE)
             if ramp is StopRamp.NONE:
                 self.power(False)
+                self._keep_set_point_age(now_ns)
             elif self._state is PowerState.OPERATION_ENABLED:
                 self._stop(ramp, now_ns)
         self._go_to_state(PowerState.FAULT_REACTION_ACTIVE, now_ns)

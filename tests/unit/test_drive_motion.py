@@ -255,6 +255,18 @@ def test_the_watchdog_is_set_by_the_master_and_counts_interpolation_times():
     assert bench.tick() == ["085#0087210000000000"]
 
 
+@pytest.mark.parametrize("reaction", [0, 2])
+def test_the_age_of_the_last_set_point_is_kept_when_the_torque_ends(reaction: int):
+    bench = cyclic_bench(DriveSettings(missing_set_point_limit=8))
+    assert bench.read(0x3051) == 0
+    bench.must(0x605E, 0, reaction, 2)
+    bench.cycle(10)
+    bench.run(50 * MS)
+    assert bench.drive.power_state is PowerState.FAULT
+    # Eight times and the half of grace, seen at the tick after; a ramp that is over already costs one tick more.
+    assert bench.read(0x3051) == (9000 if reaction == 0 else 10_000)
+
+
 def test_the_watchdog_may_be_changed_and_switched_off_in_operation():
     bench = cyclic_bench(DriveSettings(missing_set_point_limit=5))
     bench.cycle(10)

@@ -27,6 +27,11 @@ PATIENCE_S = 240.0
 ANSWER_S = 10.0
 MOVING_COUNTS = 1000
 OPERATION_ENABLED = 0x27
+HEARTBEAT_TIMEOUT_S = 1.0
+"""Of ``unhurried``, whose drives have no watchdog over SYNC: their watch over the heartbeat alone stops them."""
+STATED_S = HEARTBEAT_TIMEOUT_S + 0.2
+"""After its last set-point, by the drive's own clock, an axis is without torque: the time-out, and a ramp. A heartbeat
+that was sent after the last set-point counts from then."""
 Start = Callable[..., "subprocess.Popen[str]"]
 
 
@@ -139,6 +144,9 @@ def test_a_killed_cyclic_process_is_a_fault_of_every_drive(
     assert [node.sdo[0x603F].raw for node in drives] == [0x8130, 0x8130]
     wait_for_rest(drives)
     assert emergencies(emergency_bus) == {1: [0x8130], 2: [0x8130]}
+    ages_s = [node.sdo[0x3051].raw * 1e-6 for node in drives]
+    print(f"\ntorque off {', '.join(f'{age_s:.3f}' for age_s in ages_s)} s after the last set-point")
+    assert all(0.5 * HEARTBEAT_TIMEOUT_S < age_s < STATED_S for age_s in ages_s)
 
     output, _ = process.communicate(timeout=PATIENCE_S)
     complaints = (tmp_path / "stderr").read_text()

@@ -7,7 +7,7 @@ import pytest
 from guarded_machine import PAPER, Guarded, Silenced, at_theta2, changed
 
 from config.schema import GatewayConfig
-from drivers.objects import ABORT_CONNECTION_OPTION_CODE, SET_POINT_WATCHDOG
+from drivers.objects import ABORT_CONNECTION_OPTION_CODE, SET_POINT_AGE, SET_POINT_WATCHDOG
 
 WATCHDOG = "    sync_watchdog: {index: 0x3050, bits: 16, unit: cycles, cycles: 40}\n"
 
@@ -60,6 +60,8 @@ def assert_stopped(at_s, stated):
     strain = run.strain(at_s)
     torque_s = last_torque_s(run, at_s)
     assert (torque_s > 0.0) is (at_s > ENABLED_FROM_S), "what is not enabled stands by itself"
+    for drive in run.machine.drives if at_s > ENABLED_FROM_S else ():
+        assert drive.dictionary.entry(SET_POINT_AGE).value * 1e-6 < stated.torque_off_s
     assert strain.rest_s < stated.rest_s
     assert torque_s < stated.torque_off_s
     assert math.degrees(strain.cam_distance_rad) < stated.cam_deg
