@@ -249,10 +249,10 @@ def _timing(view: MonitorView) -> list[RenderableType]:
     for what, figures, which in (
         ("|SYNC period − cycle|", view.sync_period_deviation_us, "p50 / p99 / max, last turn"),
         ("wake-up lateness", view.wake_lateness_us, "p50 / p99 / max, last turn"),
-        ("SYNC period", (period.min, period.p50, period.max), "least / p50 / max, so far"),
-        ("last TPDO after SYNC", (arrival.p50, arrival.p99, arrival.max), "p50 / p99 / max, so far"),
-        ("last RPDO before SYNC", (lead.min, lead.p1, lead.p50), "least / p1 / p50, so far"),
-        ("processor time a cycle", (loop.p50, loop.p99, loop.max), "p50 / p99 / max, so far"),
+        ("SYNC period", (period.min, period.p50, period.max), "least / p50 / max, as far as seen"),
+        ("last TPDO after SYNC", (arrival.p50, arrival.p99, arrival.max), "p50 / p99 / max, as far as seen"),
+        ("last RPDO before SYNC", (lead.min, lead.p1, lead.p50), "least / p1 / p50, as far as seen"),
+        ("processor time a cycle", (loop.p50, loop.p99, loop.max), "p50 / p99 / max, as far as seen"),
     ):
         grid.add_row(what, row_of_numbers(*figures), which)
     missed = (
@@ -260,7 +260,10 @@ def _timing(view: MonitorView) -> list[RenderableType]:
         f"{counts.overruns} overrun, {counts.sync_lost} SYNC, {counts.bus_errors} bus error, "
         f"{counts.send_buffer_full} buffer full"
     )
-    parts: list[RenderableType] = [grid, Text(f"missed so far: {missed}", style="bold red" if counts.total else "")]
+    parts: list[RenderableType] = [
+        grid,
+        Text(f"missed, as far as seen: {missed}", style="bold red" if counts.total else ""),
+    ]
     if late is not None:
         style = "bold red" if late.not_explained else ""
         parts.append(Text(f"deadlines of the run, why missed: {late.verdict()}", style=style))
@@ -301,7 +304,7 @@ def render_view(view: MonitorView, stale_s: float = 0.0) -> RenderableType:
     sparks = Table.grid(padding=(0, 2))
     for axis in view.axes:
         known = [value for value in axis.errors_over_cycle if value is not None]
-        scale = f"{number(min(known), sign=True)} … {number(max(known), sign=True)} counts" if known else ""
+        scale = f"{number(min(known), 1, sign=True)} … {number(max(known), 1, sign=True)} counts" if known else ""
         sparks.add_row(Text(axis.name, style="bold"), Text(sparkline(axis.errors_over_cycle), style="cyan"), scale)
     parts: list[RenderableType] = [
         head,

@@ -106,7 +106,7 @@ def _guarded_value(condition: Condition, value: int, limit: int) -> str:
         case Condition.OPERATOR_STOP | Condition.SIGINT | Condition.SIGTERM:
             return "on request"
         case _:
-            return f"{value} cycles in a row"
+            return f"{value} cycles in a row" if value != 1 else "in one cycle"
 
 
 def _describe_other(event: Event) -> tuple[str, str, EventData]:
