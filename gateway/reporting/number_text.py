@@ -9,6 +9,8 @@ def number(value: float | None, decimals: int = 0, *, sign: bool = False) -> str
     """A figure as text; a dash for None."""
     if value is None:
         return NOTHING
+    # Nothing is minus nothing.
+    value = round(value, decimals) + 0.0
     text = f"{value:+,.{decimals}f}" if sign else f"{value:,.{decimals}f}"
     return text.replace("-", "−").replace(",", " ")
 

@@ -269,6 +269,8 @@ def test_json_has_the_keys_that_scripts_rely_on() -> None:
         (-115.2, 0, True, "−115"),
         (12288.0, 0, True, "+12 288"),
         (0.61071, 3, False, "0.611"),
+        (-0.04, 1, True, "+0.0"),
+        (-0.04, 1, False, "0.0"),
     ],
 )
 def test_numbers_are_set_with_a_minus_and_thin_groups(

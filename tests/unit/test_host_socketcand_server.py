@@ -15,6 +15,7 @@ from drivers.frame import Frame
 from drivers.node import Node
 from drivers.ports import Port, open_port
 from drivers.real_time import run_node
+from drivers.socketcand_word import says_no_wire
 from sim_drive import socketcand_server
 from sim_drive.socketcand_server import SocketcandServer, serve
 
@@ -84,6 +85,14 @@ def next_frame(bus: Port) -> Frame:
 
 def answers_sync() -> ScriptedNode:
     return ScriptedNode(answer=lambda frame, _: [TPDO] if frame == SYNC else [])
+
+
+def test_asked_for_its_wire_it_says_that_it_has_none_and_nobody_on_the_bus_notices() -> None:
+    node = answers_sync()
+    with serving(node) as port, connected(port) as bus:
+        assert says_no_wire("127.0.0.1", port)
+        assert bus.send(SYNC)
+        assert next_frame(bus) == TPDO
 
 
 def test_what_anyone_sends_all_others_hear() -> None:
