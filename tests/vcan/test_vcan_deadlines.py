@@ -39,7 +39,8 @@ def machine(tmp_path: Path) -> Path:
     config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
     config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
     config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    config["emulator"]["missing_sync_limit"] = 1000
+    for axis in config["axes"].values():
+        del axis["sync_watchdog"]
     config["bus"] |= {"cycle_us": CYCLE_US, "heartbeat_timeout_ms": 2000, "is_virtual": True}
     warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error", "bus_off", "end_effector_error")
     config["guard"] |= {name: {**config["guard"].get(name, {}), "reaction": "warn"} for name in warned}

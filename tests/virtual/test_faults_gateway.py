@@ -147,6 +147,7 @@ def test_the_same_faults_and_seed_give_the_same_frames_at_the_same_nanoseconds()
         Quirk.SLOW_MODE_SWITCH,
         Quirk.INTERPOLATION_TIME_IN_MILLISECONDS,
         Quirk.CYCLE_PERIOD_NEEDED,
+        Quirk.NO_ABORT_OPTION,
     ],
 )
 def test_the_gateway_lives_with_the_quirk(quirk: Quirk) -> None:
@@ -161,6 +162,7 @@ def test_the_gateway_lives_with_the_quirk(quirk: Quirk) -> None:
     [
         (Quirk.SYNCHRONOUS_TPDO_REFUSED, "node 2: SDO 1800h:02 aborted with 06090030h"),
         (Quirk.NO_CYCLIC_POSITION_MODE, "node 2: SDO 6060h:00 aborted with 06090030h"),
+        (Quirk.ABORT_OPTION_STAYS, "node 2 holds 0 in 6007h:00 (abort connection option code), although 1 was written"),
         (Quirk.TORQUE_OFFSET_NOT_MAPPABLE, "node 2: SDO 1600h:03 aborted with 06040041h"),
     ],
 )
