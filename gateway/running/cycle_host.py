@@ -114,6 +114,7 @@ class CycleHost:
         None: nobody does.
         """
         self._echo_cob_id = echo_cob_id
+        self._demands = frozenset(axis.rpdo_cob_id for axis in core.loop.axes)
         self._core = core
         self._cyclic = cyclic
         self._service = service
@@ -188,19 +189,25 @@ class CycleHost:
 
     def _send(self, frames: list[Frame]) -> None:
         loop = self._core.loop
+        # A heartbeat that goes by itself says nothing of when the demand went; in a batch the demand comes first.
+        has_demand = frames[0].cob_id in self._demands if frames else False
         if self._backlog:
             loop.note(SampleFlag.SEND_BUFFER_FULL)
             frames = _without_superseded(self._backlog, frames) + frames
+            has_demand = self._has_demand(frames)
             self._backlog = []
         send = self._cyclic.send
         for number, frame in enumerate(frames):
             if not send(frame):
                 loop.note(SampleFlag.SEND_BUFFER_FULL)
                 self._backlog = frames[number:]
-                # Not on the bus yet: as it stands now, it comes too late.
-                loop.sent(loop.sync_due_ns + loop.period_ns)
+                if self._has_demand(self._backlog):
+                    # Not on the bus yet: as it stands now, it comes too late.
+                    loop.sent(loop.sync_due_ns + loop.period_ns)
                 return
-        if self._echo_cob_id is None or not loop.is_paced:
+        if not has_demand:
+            pass
+        elif self._echo_cob_id is None or not loop.is_paced:
             loop.sent(self._clock())
         elif loop.is_closed and any(frame.cob_id == self._echo_cob_id for frame in frames):
             # Not before the bus says so.
@@ -212,6 +219,9 @@ class CycleHost:
         self._poll()
         if self._late is not None and loop.is_closed:
             self._late.tell()
+
+    def _has_demand(self, frames: list[Frame]) -> bool:
+        return any(frame.cob_id in self._demands for frame in frames)
 
     def _look_after_controller(self, controller: ControllerWatch, now_ns: int) -> None:
         loop = self._core.loop

@@ -190,6 +190,21 @@ def test_the_order_on_the_bus_tells_which_sync_takes_a_demand(prepared):
     assert believed == {None: [50, 120], 0x202: []}
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+def test_a_heartbeat_after_the_demand_does_not_make_the_demand_late(prepared, is_full):
+    """It goes, or is refused, 20 us before SYNC is due, when the demand has long been on the bus."""
+    world = World(prepared, False)
+    world.cycles = 3
+    world.host.run()
+    loop = world.core.loop
+    loop._is_closed, loop._sent_ns = True, world.now_ns - 700_000
+    world.full_sends = {len(world.sent)} if is_full else set()
+    world.host._send([Frame(0x77F, b"\x05")])
+    assert loop._sent_ns == world.now_ns - 705_000
+    world.host._send([Frame(0x201, bytes(8)), Frame(0x202, bytes(8))])
+    assert loop._sent_ns == world.now_ns
+
+
 def test_a_demand_that_never_got_onto_the_bus_has_missed_its_deadline(prepared):
     world = World(prepared, True)
     send, world.send = world.send, lambda frame: (world.now_ns // MS) % 50 != 20 and send(frame)

@@ -125,6 +125,7 @@ class LateCore:
     is_running = is_closed = is_paced = False
     arrival_offset_ns = sync_due_ns = cycle = 0
     period_ns = 1_000_000
+    axes = ()
 
     def __init__(self, wakes):
         self.left = wakes
