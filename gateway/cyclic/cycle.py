@@ -258,6 +258,7 @@ class CyclicLoop:
     def rejoin_bus(self) -> None:
         """The own controller is back; the next SYNC is seen again, the next demand taken."""
         self.is_off_bus = False
+        self._watch.let_settle()
 
     def follow(self, demand: Demand | None, observer: ErrorObserver | None = None) -> None:
         """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions.

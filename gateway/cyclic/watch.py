@@ -16,6 +16,8 @@ from mechanism.slave_law import SlaveLaw
 
 STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
+SETTLING_CYCLES: Final = 10
+"""Cycles for which an axis may stand where its direction turns, or its friction holds it, before it is in motion."""
 MICROMETRES: Final = 1e6
 
 _RAMP_UP: Final = Phase.RAMP_UP
@@ -53,13 +55,26 @@ class CamWindow:
 class _WatchedAxis:
     """One axis, its limits, and what it was in the cycle before."""
 
-    __slots__ = ("actual", "axis", "error", "frozen_counts", "is_fresh", "target", "torque", "travelled", "velocity")
+    __slots__ = (
+        "actual",
+        "axis",
+        "error",
+        "frozen_counts",
+        "is_fresh",
+        "settling",
+        "target",
+        "torque",
+        "travelled",
+        "velocity",
+    )
 
     def __init__(self, axis: AxisChannel, limits: AxisLimits) -> None:
         self.axis = axis
         self.velocity = limits.velocity_counts_per_cycle
         self.torque = limits.torque_permille
         self.frozen_counts = limits.frozen_counts
+        self.settling = 0
+        """Cycles without movement that say nothing of the resolver yet."""
         self.actual = 0
         self.target = 0
         self.error = 0
@@ -125,6 +140,11 @@ class CycleWatch:
             ):
                 return
             self._check_cam(cam, master.error, slave.error, master_position, now_ns)
+
+    def let_settle(self) -> None:
+        """All axes have been left without a demand, and have to be set in motion anew: until then they may stand."""
+        for watched in self._watched:
+            watched.settling = SETTLING_CYCLES
 
     def note_silence(self, awaited: int) -> None:
         """One cycle of which only this counts: whose TPDO is missing (bits as for ``check``)."""
@@ -201,6 +221,9 @@ class CycleWatch:
             watched.travelled = 0
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)
+            return
+        if watched.settling:
+            watched.settling -= 1
             return
         travel = (target - watched.target + HALF_RANGE & RANGE_MASK) - HALF_RANGE
         watched.travelled += travel if travel > 0 else -travel

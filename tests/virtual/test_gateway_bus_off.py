@@ -169,6 +169,14 @@ def test_a_controller_that_stays_away_is_given_up(phase):
     assert not outage.sent_by_gateway(outage.at_ns + MS, run.bus.now_ns)
 
 
+@pytest.mark.parametrize(
+    ("phase", "for_s"), [("return stroke", 0.010), pytest.param("cam", 0.006, marks=pytest.mark.slow)]
+)
+def test_an_axis_that_has_to_be_set_in_motion_again_is_not_taken_for_frozen(phase, for_s):
+    run = Outage(instant(phase), for_s, reacting(Reaction.CONTROLLED_STOP)).run
+    assert {trip.condition for trip in run.trips} == {Condition.BUS_OFF}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("reaction", [Reaction.CONTROLLED_STOP, Reaction.DISABLE])
 @pytest.mark.parametrize("for_s", [0.010, 0.150, None])
