@@ -59,7 +59,14 @@ def is_decisive(event: EventData) -> bool:
     """Whether the event has stopped the run, ended it, or says what became of the machine."""
     kind = event.get("kind")
     # A recording that does not name the reaction may have been stopped by it.
-    return kind in _ALWAYS or (kind == "guard" and event.get("reaction") != Reaction.WARN.value)
+    if kind == "guard":
+        return event.get("reaction") != Reaction.WARN.value
+    return kind in _ALWAYS or _is_quick_stop(event)
+
+
+def _is_quick_stop(event: EventData) -> bool:
+    """A quick stop that an operator asks for has no trip of the guard before it."""
+    return event.get("kind") == "step" and event.get("text") == "quick stop"
 
 
 def is_alarming(event: EventData) -> bool:
@@ -67,7 +74,7 @@ def is_alarming(event: EventData) -> bool:
     kind = event.get("kind")
     if kind in ("end", "recovery"):
         return event.get("is_ready") is False
-    return is_decisive(event) and event.get("condition") not in _WISHES
+    return is_decisive(event) and event.get("condition") not in _WISHES and not _is_quick_stop(event)
 
 
 def choose_events(events: Sequence[EventData], most: int = MOST_SHOWN) -> EventChoice:

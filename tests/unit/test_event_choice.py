@@ -116,10 +116,11 @@ def test_a_stop_that_somebody_asked_for_is_no_alarm(tmp_path):
     wish = {**TRIP, "condition": "sigint", "reaction": "controlled_stop", "text": "sigint: on request"}
     with RecordingWriter(path, RecordingMetadata(CONSTANTS, "", "")) as writer:
         writer.write_samples(steady_run(100))
-        for event in timed([wish, END]):
+        for event in timed([wish, {"kind": "step", "text": "quick stop"}, STEP, END]):
             writer.write_event(RunEvent(event))
         writer.close({"stopped_by": "operator"})
     report = analyse(read_recording(path))
-    assert [event.is_alarming for event in report.decisive] == [False, False]
+    assert [event.text for event in report.decisive] == ["sigint: on request", "quick stop", "stopped by torque"]
+    assert not any(event.is_alarming for event in report.decisive)
     assert "sigint: on request" in _what_stopped_it(report)
     assert _what_stopped_it(replace(report, decisive=report.decisive[-1:])) == "", "a run that completed has no stop"
