@@ -335,6 +335,8 @@ def test_every_condition_of_each_axis_at_every_stage(condition, node, moment):
     "moment", ["return stroke", *(pytest.param(name, marks=pytest.mark.slow) for name in ("cam", "cam, farther"))]
 )
 def test_a_controlled_stop_from_full_speed_is_as_fast_as_its_limits_and_no_faster(moment):
-    run = carry_out(CASES[Condition.OPERATOR_STOP, MACHINE], moment)
+    case = CASES[Condition.OPERATOR_STOP, MACHINE]
+    run = carry_out(case, moment)
+    assert_linkage(case, moment, run)
     limits = PAPER.motion.ramp_acceleration_rad_per_s2, PAPER.motion.ramp_jerk_rad_per_s3
     assert assert_demand_is_gentle(run) == pytest.approx(limits, rel=1e-3)

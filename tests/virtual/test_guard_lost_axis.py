@@ -8,7 +8,6 @@ from guarded_machine import CV, PAPER, SERVO, Guarded, at_theta2, changed, momen
 
 from gateway.cyclic.guard import StopReason
 from gateway.record.sample import Phase
-from gateway.running.core import GatewayCore
 from sim_drive.injection.faults import Fault, FaultKind
 
 BOUND_RAD = math.radians(20.0)
@@ -119,9 +118,10 @@ def test_a_gateway_that_looks_on_tears_the_linkage():
 
 
 STOPS = {
-    "controlled": GatewayCore.request_stop,
-    "quick": GatewayCore.request_quick_stop,
+    "controlled": ("cam, farther", 0.28, Phase.CONTROLLED_STOP),
+    "quick": ("return stroke", 0.01, Phase.QUICK_STOP),
 }
+"""When it is called for, how much later the axis is lost, and in which phase."""
 
 
 @pytest.mark.parametrize(
@@ -138,13 +138,16 @@ STOPS = {
 )
 def test_an_axis_that_is_lost_in_the_middle_of_a_stop(stop, kind, node):
     """The controlled stop then becomes a quick one; the quick one goes on with the axis that is left."""
-    at_s = moments()["return stroke"].at_s
+    called, after_s, phase = STOPS[stop]
+    at_s = moments()[called].at_s
     run = Guarded().until(at_s)
-    STOPS[stop](run.core)
+    (run.core.request_stop if stop == "controlled" else run.core.request_quick_stop)()
     run.bus.refresh()
-    lost_s = at_s + (0.5 if stop == "controlled" else 0.01)
+    lost_s = at_s + after_s
     run.until(lost_s)
-    assert run.place[1] is (Phase.CONTROLLED_STOP if stop == "controlled" else Phase.QUICK_STOP)
+    assert run.place[1] is phase
+    # In the return stroke, at more than half of its speed.
+    assert run.core.session.demand.velocities[1] < -10.0
     run.inject(Fault(kind, node, 0.0, 0.5 if kind is FaultKind.POWER_CYCLE else None)).to_end()
     assert run.stopped_by is StopReason.OPERATOR
     assert run.phases >= {Phase.QUICK_STOP, Phase.DISABLED}
