@@ -44,7 +44,7 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
             is_torn = rig.plant.torn_at_s is not None
             rig.settle(session)
             # A linkage that nobody could hold may stand where no run can begin.
-            rig.is_ready = not judge.unheld
+            rig.is_ready = judge.leaves_a_start
             found += judge.judge_truth()
             if is_telling or found:
                 tell = f"session {number}: {session.core.stopped_by.value}, {session.core.failure}; {told(session)}"

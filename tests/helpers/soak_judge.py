@@ -21,12 +21,13 @@ TWO_COUNTS_RAD = 2.0 * math.tau / 4096
 RUNNING_BOUND_DEG = 1.5
 """From the cam once the machine is at speed, before anything has happened."""
 CONTROLLED_BOUND_DEG = 3.0
-QUICK_BOUND_DEG = 6.0
-"""Of a slave that has torque, sees, and is told where the master is."""
+QUICK_BOUND_DEG = 16.0
+"""Of a slave that has torque, sees, and is told where the master is: a brake stops a lost master faster than it can."""
 LOST_BOUND_DEG = 20.0
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
-FROZEN_AT_REST_BOUND_DEG = 60.0
+FROZEN_AT_REST_BOUND_DEG = 90.0
+FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
@@ -89,7 +90,15 @@ class Judge:
         self.stop = self._stop()
         self.unheld = self._unheld()
         """Why nothing that any gateway does could keep the linkage within the bounds; empty where it can."""
+        self.is_frozen_at_rest = any(
+            fault.kind is FaultKind.FROZEN_RESOLVER and moment in AT_REST for fault, moment in self.faults
+        )
         self.figures = self._measure()
+
+    @property
+    def leaves_a_start(self) -> bool:
+        """Whether the linkage was held well enough for a next run to begin where it stands."""
+        return not (self.unheld or self.is_frozen_at_rest)
 
     def judge(self) -> list[str]:
         """What is beyond its bound, each in a sentence."""
@@ -259,12 +268,13 @@ class Judge:
         least = min(LEAST_SINE, figures.first_sine - STANDING_SINE_LOSS)
         if not self.session.is_law_plain or Phase.APPROACH in self.phases:
             least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
+        least = min(least, FROZEN_AT_REST_SINE) if self.is_frozen_at_rest else least
         if not figures.least_sine > least:
             self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
         if self.stop == "none":
             return
         lost = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
-        if any(f.kind is FaultKind.FROZEN_RESOLVER and moment in AT_REST for f, moment in self.faults):
+        if self.is_frozen_at_rest:
             lost = FROZEN_AT_REST_BOUND_DEG
         bound = {"controlled": CONTROLLED_BOUND_DEG, "quick": QUICK_BOUND_DEG}.get(self.stop, lost) + self._jumped_deg()
         if figures.cam_deg > bound:
