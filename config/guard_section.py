@@ -10,6 +10,8 @@ from config.model import Model
 COUNT_RESOLUTION = 2
 """Counts within which a position is not known: a limit below that trips by itself."""
 _MAX_INTEGER16 = 32767
+_LONGEST_PERSISTENCE_S = 10.0
+"""Whatever has held for so long without a reaction is never going to be stopped in time."""
 _MAX_VELOCITY_PERCENT = 1000.0
 
 Persistence = Annotated[int, Field(ge=1, le=100_000)]
@@ -82,14 +84,20 @@ class LengthCondition(ConditionSection):
     limit_mm: Annotated[float, Field(gt=0.0)]
 
 
-class CyclesCondition(ConditionSection):
-    """A condition whose limit is a number of cycles."""
+class EventCondition(Model):
+    """A condition that is an event: it has happened, and does not hold from cycle to cycle."""
+
+    reaction: Reaction
+
+
+class CyclesCondition(EventCondition):
+    """An event that is one from so many cycles on."""
 
     limit_cycles: Annotated[int, Field(ge=1)]
 
 
-class CodesCondition(ConditionSection):
-    """A condition that holds for some emergency error codes alone."""
+class CodesCondition(EventCondition):
+    """An event of some emergency error codes alone."""
 
     codes: frozenset[ErrorCode]
 
@@ -109,6 +117,10 @@ class StopSection(Model):
 _WARN, _CONTROLLED, _QUICK, _DISABLE = Reaction
 
 
+_OF_THE_BUS = frozenset({"missed_tpdo", "axis_silent", "missed_deadline", "bus_off"})
+"""Conditions for which the drives, or the gateway, have a time-out of their own."""
+
+
 class GuardSection(Model):
     """Every condition that the cycle watches, each with one reaction."""
 
@@ -124,16 +136,19 @@ class GuardSection(Model):
     """Distance of the end effector from where the demand has it."""
     frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, persistence_cycles=3, reaction=_DISABLE)
     """The demand has gone so far while the actual value has not changed by a single count."""
+    unanswered_torque: TorqueCondition = TorqueCondition(limit_permille=250, persistence_cycles=8, reaction=_DISABLE)
+    """The torque actual value has changed so far, with the torque offset and without, while the actual value has not
+    changed by a single count: a blocked axis, or a dead resolver. Looked at where torque offsets are sent."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
     axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)
     """An axis' TPDO is missing while another axis' have come: it is that drive, not the bus or the host."""
     missed_deadline: ConditionSection = ConditionSection(persistence_cycles=20, reaction=_CONTROLLED)
-    emergency: ConditionSection = ConditionSection(reaction=_QUICK)
+    emergency: EventCondition = EventCondition(reaction=_QUICK)
     emergency_warning: CodesCondition = CodesCondition(codes=frozenset({0x8110, 0x8120}), reaction=_WARN)
     """EMCY codes that are none of an axis' own faults: overrun and error passive of its CAN controller."""
     drive_fault: ConditionSection = ConditionSection(reaction=_QUICK)
     """The statusword is not that of Operation enabled."""
-    heartbeat_lost: ConditionSection = ConditionSection(reaction=_QUICK)
+    heartbeat_lost: EventCondition = EventCondition(reaction=_QUICK)
     bus_off: ConditionSection = ConditionSection(persistence_cycles=20, reaction=_QUICK)
     """No drive is heard at all for so long, or, at once, the gateway's own controller has left the bus."""
     sync_lost: CyclesCondition = CyclesCondition(limit_cycles=5, reaction=_QUICK)
@@ -151,14 +166,37 @@ class GuardSection(Model):
                 f"guard.sync_lost.limit_cycles: {self.sync_lost.limit_cycles} can never trip in time, after "
                 f"{gap_ms:g} ms the drives have missed the gateway's heartbeat (bound {heartbeat_timeout_ms} ms)"
             )
+        for key in type(self).model_fields:
+            condition = getattr(self, key)
+            if not isinstance(condition, ConditionSection):
+                continue
+            span_ms = condition.persistence_cycles * cycle_us / 1000.0
+            if key in _OF_THE_BUS and span_ms >= heartbeat_timeout_ms:
+                raise ValueError(
+                    f"guard.{key}.persistence_cycles: {condition.persistence_cycles} can never trip in time, after "
+                    f"{span_ms:g} ms the heartbeats are missed (bound: below {heartbeat_timeout_ms} ms)"
+                )
+            if span_ms > 1000.0 * _LONGEST_PERSISTENCE_S:
+                raise ValueError(
+                    f"guard.{key}.persistence_cycles: {condition.persistence_cycles} can never trip in time, they are "
+                    f"{span_ms / 1000.0:g} s (bound {_LONGEST_PERSISTENCE_S:g} s)"
+                )
 
-    def check_axis(self, name: str, counts_per_revolution: int, following_error_counts: int) -> None:
-        """Raise ValueError for an axis' limit that can never trip, or always trips."""
+    def check_axis(self, name: str, counts_per_revolution: int, drive_counts: int, gateway_counts: int) -> None:
+        """Raise ValueError for an axis' limit that can never trip, or always trips.
+
+        ``drive_counts`` and ``gateway_counts``: following errors at which the drive and the gateway react.
+        """
         half = counts_per_revolution // 2
-        if following_error_counts >= half:
+        if drive_counts >= half:
             raise ValueError(
-                f"axes.{name}.limits.following_error_counts: {following_error_counts} can never trip, half a "
+                f"axes.{name}.limits.following_error_counts: {drive_counts} can never trip, half a "
                 f"revolution away from its demand the linkage is torn (bound: below {half})"
+            )
+        if gateway_counts < COUNT_RESOLUTION:
+            raise ValueError(
+                f"axes.{name}.limits: a following error of {gateway_counts} counts would always trip, a position is "
+                f"not known better than to {COUNT_RESOLUTION} (bound {COUNT_RESOLUTION})"
             )
         for key, condition in (("cam_window", self.cam_window), ("frozen_actual", self.frozen_actual)):
             counts = condition.limit_deg / 360.0 * counts_per_revolution
@@ -174,10 +212,10 @@ class GuardSection(Model):
                 "another (bound: below 180)"
             )
         travel = self.frozen_actual.limit_deg / 360.0 * counts_per_revolution
-        if travel >= following_error_counts:
+        if travel >= gateway_counts:
             raise ValueError(
                 f"guard.frozen_actual.limit_deg: {self.frozen_actual.limit_deg:g} can never trip, the following error "
-                f"of axis {name} does so first (bound {following_error_counts * 360.0 / counts_per_revolution:.3g})"
+                f"of axis {name} does so first (bound {gateway_counts * 360.0 / counts_per_revolution:.3g})"
             )
 
     def check_end_effector(self, reach_mm: float, counts_per_revolution: int) -> None:

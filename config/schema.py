@@ -386,7 +386,10 @@ class GatewayConfig(Model):
         for name, axis in self.axes.items():
             if axis.sync_watchdog is not None:
                 axis.sync_watchdog.check(name, self.bus.cycle_us, self.guard.sync_lost.limit_cycles)
-            self.guard.check_axis(name, axis.counts_per_revolution, axis.limits.following_error_counts)
+            limits = axis.limits
+            self.guard.check_axis(
+                name, axis.counts_per_revolution, limits.following_error_counts, limits.gateway_error_counts
+            )
             links = self.machine.five_bar
             self.guard.check_end_effector(links.p_mm + links.q_mm, axis.counts_per_revolution)
         return self

@@ -537,8 +537,12 @@ class CyclicLoop:
             # Drives without torque call for no reaction; which of them is there is asked all the same.
             self._watch.note_silence(self._awaited)
             return
-        master_position, _, _, targets, _, phase = self._in_force
-        self._watch.check(self._awaited, targets, master_position, phase, self.is_guarding_enabled, now_ns)
+        master_position, _, _, targets, torque_offsets, phase = self._in_force
+        stop = self._coupled_stop
+        followers = stop.followers if stop is not None and self._demand is stop and phase is Phase.QUICK_STOP else 0
+        self._watch.check(
+            self._awaited, targets, torque_offsets, master_position, phase, self.is_guarding_enabled, followers, now_ns
+        )
         if self.guard.tripped:
             self.react()
 

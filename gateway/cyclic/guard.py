@@ -17,6 +17,7 @@ class Condition(Enum):
     TORQUE = "torque"
     END_EFFECTOR_ERROR = "end_effector_error"
     FROZEN_ACTUAL = "frozen_actual"
+    UNANSWERED_TORQUE = "unanswered_torque"
     MISSED_TPDO = "missed_tpdo"
     AXIS_SILENT = "axis_silent"
     MISSED_DEADLINE = "missed_deadline"
@@ -57,6 +58,7 @@ class StopReason(Enum):
     TORQUE = "torque"
     END_EFFECTOR_ERROR = "end_effector_error"
     FROZEN_ACTUAL = "frozen_actual"
+    UNANSWERED_TORQUE = "unanswered_torque"
     MISSED_TPDO = "missed_tpdo"
     AXIS_SILENT = "axis_silent"
     MISSED_DEADLINE = "missed_deadline"
@@ -87,9 +89,9 @@ class GuardTripped(Event):
 
     ``axis`` is the axis' name, empty where the condition is not one axis'. ``value`` and ``limit`` are in the
     condition's own unit: counts for following error, cam window and frozen actual value, counts a cycle for the
-    velocity, per mille of rated torque, micrometres for the end effector, cycles (in a row) for whatever is missed, ms
-    for the heartbeat; the emergency error code or the statusword, with limit 0, for what has none. Bus-off has limit 0
-    where the own controller has told it, else the cycles in which no drive was heard.
+    velocity, per mille of rated torque for torque and unanswered torque, micrometres for the end effector, cycles (in a
+    row) for whatever is missed, ms for the heartbeat; the emergency error code or the statusword, with limit 0, for
+    what has none. Bus-off has limit 0 where the own controller has told it, else the cycles without any drive's frame.
     """
 
     condition: Condition

@@ -115,6 +115,11 @@ class CoupledStop:
         self.velocities = [self.master_velocity, slope * self.master_velocity]
         self.is_finished = self._rest_cycles >= self._standstill_cycles
 
+    @property
+    def followers(self) -> int:
+        """Bit n: axis n follows its targets still."""
+        return 0 if self.is_finished or self._slave.controlword == COMMAND_QUICK_STOP else 1 << SLAVE
+
     def controlled_stop(self) -> None:
         """Nothing: this is a stop, and a stronger one."""
 

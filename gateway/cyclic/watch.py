@@ -32,9 +32,13 @@ class AxisLimits:
     torque_permille: int
     frozen_counts: int
     """Travel of the demand while the actual value stays the same."""
+    unanswered_permille: int
+    """Change of torque while the actual value stays the same."""
 
 
-NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX)
+NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX)
+STILL_CYCLES: Final = 16
+"""So long after its last count an axis' torque is what its standing takes: a count is a blow to a controller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,10 +65,16 @@ class _WatchedAxis:
         "error",
         "frozen_counts",
         "is_fresh",
+        "leap",
+        "leap_cycles",
         "settling",
+        "still_cycles",
+        "still_offset",
+        "still_torque",
         "target",
         "torque",
         "travelled",
+        "unanswered",
         "velocity",
     )
 
@@ -73,6 +83,7 @@ class _WatchedAxis:
         self.velocity = limits.velocity_counts_per_cycle
         self.torque = limits.torque_permille
         self.frozen_counts = limits.frozen_counts
+        self.unanswered = limits.unanswered_permille
         self.settling = 0
         """Cycles without movement that say nothing of the resolver yet."""
         self.actual = 0
@@ -80,6 +91,14 @@ class _WatchedAxis:
         self.error = 0
         self.travelled = 0
         """Counts that the demand has gone since the actual value changed last."""
+        self.leap = 0
+        """Counts since the axis was too fast first, and cycles."""
+        self.leap_cycles = 0
+        self.still_cycles = 0
+        """Cycles since the actual value changed last."""
+        self.still_torque = 0
+        """Torque actual value when the axis had just come to stand, and the torque offset then."""
+        self.still_offset = 0
         self.is_fresh = False
         """The actual value of the cycle before is known."""
 
@@ -107,10 +126,20 @@ class CycleWatch:
             end_effector_miss(cam.geometry, cam.closure, 0.0, 0.0, 0.0, 0.0)
 
     def check(
-        self, awaited: int, targets: Sequence[int], master_position: float, phase: Phase, is_enabled: bool, now_ns: int
+        self,
+        awaited: int,
+        targets: Sequence[int],
+        torque_offsets: Sequence[int],
+        master_position: float,
+        phase: Phase,
+        is_enabled: bool,
+        followers: int,
+        now_ns: int,
     ) -> None:
-        """One cycle. ``awaited``: bit n, the TPDO of axis n is missing; ``targets`` (counts), ``master_position`` (rad)
-        and ``phase`` are those in force at its SYNC; ``is_enabled``: all drives are meant to be in Operation enabled.
+        """One cycle. ``awaited``: bit n, the TPDO of axis n is missing; ``targets`` (counts), ``torque_offsets`` (per
+        mille), ``master_position`` (rad) and ``phase`` are those in force at its SYNC; ``is_enabled``: all drives are
+        meant to be in Operation enabled; ``followers``: bit n, axis n still follows its targets in a stop in which they
+        are not.
         """
         guard = self._guard
         if awaited:
@@ -125,7 +154,9 @@ class CycleWatch:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
             if is_enabled:
-                self._check_axis(number, watched, targets[number], now_ns)
+                self._check_axis(number, watched, targets[number], torque_offsets[number], now_ns)
+            elif followers >> number & 1:
+                self._check_follower(number, watched, targets[number], now_ns)
             else:
                 watched.is_fresh = False
         cam = self._cam
@@ -166,7 +197,7 @@ class CycleWatch:
         else:
             guard.clear(Condition.BUS_OFF, 0)
 
-    def _check_axis(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
+    def _check_axis(self, number: int, watched: _WatchedAxis, target: int, torque_offset: int, now_ns: int) -> None:
         axis = watched.axis
         actual, torque = axis.actual, axis.torque
         watched.error = error = (target - actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
@@ -182,9 +213,20 @@ class CycleWatch:
             and -velocity <= moved <= velocity
         ):
             self._check_drive(number, watched, now_ns)
-            self._check_motion(number, watched, target, moved, now_ns)
+            self._check_velocity(number, watched, moved, now_ns)
+            if self._check_answer(number, watched, target, moved, now_ns):
+                self._check_push(number, watched, torque_offset, now_ns)
         else:
-            watched.travelled = 0
+            watched.travelled = watched.still_cycles = 0
+        watched.actual = actual
+        watched.target = target
+        watched.is_fresh = True
+
+    def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
+        """A resolver that dies in a stop is as bad as in a run."""
+        actual = watched.axis.actual
+        moved = (actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        self._check_answer(number, watched, target, moved, now_ns)
         watched.actual = actual
         watched.target = target
         watched.is_fresh = True
@@ -206,29 +248,63 @@ class CycleWatch:
         elif not guard.is_quiet:
             guard.clear(Condition.TORQUE, number)
 
-    def _check_motion(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> None:
-        guard = self._guard
+    def _check_velocity(self, number: int, watched: _WatchedAxis, moved: int, now_ns: int) -> None:
+        """A single leap counts for as long as it is more than the axis could have gone since: a glitch goes back."""
         if not watched.is_fresh:
-            watched.travelled = 0
+            watched.leap_cycles = 0
             return
-        bound = watched.velocity
-        if not -bound <= moved <= bound:
-            guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
-        elif not guard.is_quiet:
-            guard.clear(Condition.VELOCITY, number)
-        if moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
+        guard, bound = self._guard, watched.velocity
+        if watched.leap_cycles:
+            watched.leap += moved
+        else:
+            watched.leap = moved
+        watched.leap_cycles += 1
+        reach = bound * watched.leap_cycles
+        if -bound <= moved <= bound and -reach <= watched.leap <= reach:
+            watched.leap_cycles = 0
+            if not guard.is_quiet:
+                guard.clear(Condition.VELOCITY, number)
+            return
+        guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
+
+    def _check_answer(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> bool:
+        """Whether an axis that is asked to move shows anything of it; returns whether it stands on one count."""
+        guard = self._guard
+        if not watched.is_fresh or moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
             # A drive that has had no new target stands, whatever its resolver shows.
-            watched.travelled = 0
+            watched.travelled = watched.still_cycles = 0
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)
-            return
+                guard.clear(Condition.UNANSWERED_TORQUE, number)
+            return False
         if watched.settling:
             watched.settling -= 1
-            return
+            return False
         travel = (target - watched.target + HALF_RANGE & RANGE_MASK) - HALF_RANGE
         watched.travelled += travel if travel > 0 else -travel
         if watched.travelled > watched.frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
+        return True
+
+    def _check_push(self, number: int, watched: _WatchedAxis, torque_offset: int, now_ns: int) -> None:
+        """Whether an axis that stands on one count is pushed more and more."""
+        guard, torque = self._guard, watched.axis.torque
+        watched.still_cycles += 1
+        if watched.still_cycles <= STILL_CYCLES:
+            watched.still_torque, watched.still_offset = torque, torque_offset
+            return
+        pushed = torque - watched.still_torque
+        # Neither a load that the offset foresees is a push, nor an offset that takes a load over from the controller.
+        unforeseen = pushed - (torque_offset - watched.still_offset)
+        push = min(abs(pushed), abs(unforeseen))
+        if push > watched.unanswered and self._is_plain():
+            guard.hold(Condition.UNANSWERED_TORQUE, number, push, watched.unanswered, now_ns)
+        elif not guard.is_quiet:
+            guard.clear(Condition.UNANSWERED_TORQUE, number)
+
+    def _is_plain(self) -> bool:
+        """A slave that is moved apart from its cam is held against loads that nobody foresees."""
+        return self._cam is None or self._cam.law.is_plain
 
     def _check_cam(
         self, cam: CamWindow, master_error: int, slave_error: int, master_position: float, now_ns: int

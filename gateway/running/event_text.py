@@ -20,6 +20,7 @@ _UNITS: Final = {
     Condition.FOLLOWING_ERROR: "counts",
     Condition.CAM_WINDOW: "counts",
     Condition.FROZEN_ACTUAL: "counts of demand, the actual value stays",
+    Condition.UNANSWERED_TORQUE: "per mille of torque, the actual value stays",
     Condition.VELOCITY: "counts a cycle",
     Condition.TORQUE: "per mille of rated torque",
 }

@@ -4,6 +4,7 @@ It is a procedure that says until when it waits; ``gateway.running.core`` resume
 """
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -210,34 +211,46 @@ class MachineSession:
     def _enable_all(self) -> Procedure[None]:
         self._step("enabling the axes")
         yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), _cyclic_mode(node)))
-        problems = self._away_from_start([axis.channel.actual for axis in self.axes])
+        before = [axis.channel.actual for axis in self.axes]
+        problems = self._away_from_start(before, "stands at")
         if problems and self._approach is not None:
             self._way = self._find_way(self._approach)
         elif problems:
             raise CommissioningError(problems)
         # Until now the target of each axis was its actual position; from here on it is held where it then is.
         yield from for_all(self._nodes, lambda node: self.power.enable(self._axis(node)))
-        # An axis is held where it, or its resolver, has come to meanwhile: that may not be where it was.
-        problems = [] if self._way else self._away_from_start([axis.channel.target for axis in self.axes])
+        held = [axis.channel.target for axis in self.axes]
+        problems = self._moved_apart(before, held) if self._way else self._away_from_start(held, "is now held at")
+        problems = problems or self._moved_apart(held, [axis.channel.actual for axis in self.axes])
         if problems:
             raise CommissioningError(problems)
         self.loop.is_guarding_enabled = True
         self.loop.phase = Phase.STANDSTILL
 
-    def _away_from_start(self, positions: list[int]) -> list[str]:
-        """A sentence for each axis that stands, at these counts, too far from where the plan begins."""
+    def _away_from_start(self, positions: Sequence[int], what: str) -> list[str]:
+        """What is wrong with ``positions`` (counts) as a place to begin the plan from: a sentence an axis."""
         master, slave = positions
-        targets = self.demand.align(self.plan.at(0.0)[0], (master, slave))
         problems: list[str] = []
-        for axis, position, target in zip(self.axes, positions, targets, strict=True):
+        for axis, position, target in zip(
+            self.axes, positions, self.demand.align(self.plan.at(0.0)[0], (master, slave)), strict=True
+        ):
             window = axis.channel.units.counts_in(START_WINDOW_RAD)
             if abs(position - target) > window:
                 problems.append(
-                    f"axis {axis.node.name}: stands at {position} counts, the cam starts at {target}, "
-                    f"which is more than {window} counts away; bring the linkage to its home position, or start from "
-                    "where it stands (--from-here)"
+                    f"axis {axis.node.name}: {what} {position} counts, the cam starts at {target}, which is more than "
+                    f"{window} counts away; bring the linkage to its home position, or start from where it stands "
+                    "(--from-here)"
                 )
         return problems
+
+    def _moved_apart(self, before: Sequence[int], after: Sequence[int]) -> list[str]:
+        """Axes that are not where they were to be when all of them were enabled: a sentence each."""
+        return [
+            f"axis {axis.node.name}: was to be held at {stood} counts and is at {position} after enabling, more than "
+            f"{window} counts away; look at its resolver and its brake"
+            for axis, stood, position in zip(self.axes, before, after, strict=True)
+            if abs(position - stood) > (window := axis.channel.units.counts_in(START_WINDOW_RAD))
+        ]
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.

@@ -26,7 +26,7 @@ from gateway.units import AxisUnits
 pytestmark = pytest.mark.bench
 __all__ = ["calls"]
 
-ROUNDS = 3
+ROUNDS = 5
 CYCLES = 3000
 
 

@@ -11,7 +11,7 @@ from config.loading import ConfigError, load_config, parse_config
 from drivers.virtual_time import VirtualBus
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.guard import REASON_OF, Condition, Guard, StopReason
-from gateway.cyclic.watch import AxisLimits, CycleWatch
+from gateway.cyclic.watch import NO_LIMITS, STILL_CYCLES, AxisLimits, CycleWatch
 from gateway.record.sample import Phase
 from gateway.running.assembly import build_core, guard_limits, slave_law
 from gateway.running.preparation import compile_config, prepare
@@ -23,7 +23,7 @@ PAPER = load_config("paper")
 PROFILE = compile_config(PAPER).profile
 UNITS = AxisUnits(4096, 0.0, 1.5)
 ENABLED, FAULT = 0x1237, 0x0218
-LIMITS = AxisLimits(velocity_counts_per_cycle=20.5, torque_permille=2500, frozen_counts=11)
+LIMITS = AxisLimits(velocity_counts_per_cycle=20.5, torque_permille=2500, frozen_counts=11, unanswered_permille=250)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,14 +51,38 @@ class Refusal:
         Refusal(
             "limit_deg: 20", "limit_deg: 0.17", "guard.cam_window.limit_deg: 0.17 would always trip, it is less than 2"
         ),
-        Refusal("limit_deg: 1.0", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
-        Refusal("limit_deg: 1.0", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
+        Refusal("limit_deg: 0.25", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
+        Refusal("limit_deg: 0.25", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
         Refusal("limit_mm: 50", "limit_mm: 800", "can never trip, the linkage reaches 400 mm (bound: below 800)"),
         Refusal("limit_mm: 50", "limit_mm: 1", "would always trip, the resolvers tell the end effector to 1.2 mm"),
         Refusal(
             "following_error_counts: 300", "following_error_counts: 2048", "2048 can never trip, half a revolution"
         ),
         Refusal("limit_cycles: 20", "limit_cycles: 200", "can never trip in time, after 200 ms the drives have missed"),
+        Refusal(
+            "heartbeat_lost: {", "heartbeat_lost: {persistence_cycles: 2, ", "guard.heartbeat_lost.persistence_cycles"
+        ),
+        Refusal("emergency: {", "emergency: {persistence_cycles: 2, ", "guard.emergency.persistence_cycles"),
+        Refusal(
+            "missed_tpdo: {persistence_cycles: 20",
+            "missed_tpdo: {persistence_cycles: 200",
+            "guard.missed_tpdo.persistence_cycles: 200 can never trip in time, after 200 ms the heartbeats are missed",
+        ),
+        Refusal(
+            "limit_percent: 130, persistence_cycles: 5",
+            "limit_percent: 130, persistence_cycles: 10001",
+            "10001 can never trip in time, they are 10.001 s (bound 10 s)",
+        ),
+        Refusal(
+            "following_error_counts: 200",
+            "following_error_counts: 200\n      guarded_error_counts: 1",
+            "axes.cv.limits: a following error of 1 counts would always trip",
+        ),
+        Refusal(
+            "following_error_counts: 200",
+            "following_error_counts: 200\n      guarded_error_counts: 2",
+            "guard.frozen_actual.limit_deg: 0.25 can never trip, the following error of axis cv does so first",
+        ),
         Refusal(
             "sigterm: {reaction: controlled_stop}", "sigterm: {reaction: warn}", "warn would leave the machine running"
         ),
@@ -89,11 +113,16 @@ def make(limits=LIMITS, **replaced):
     return guard, axes, watch
 
 
+def check(watch, cycle, demand=0, awaited=0, phase=Phase.STANDSTILL, offset=0, is_enabled=True, followers=0):
+    """One cycle in which the servo axis' target is ``demand``, its torque offset ``offset``."""
+    watch.check(awaited, [0, demand], [0, offset], 0.0, phase, is_enabled, followers, cycle)
+
+
 def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
     """``track``: (demand, actual) of the servo axis by cycle; returns the cycle of the first trip, None for none."""
     for cycle, (demand, actual) in enumerate(track):
         axes[1].actual = actual
-        watch.check(awaited, [0, demand], 0.0, phase, True, cycle)
+        check(watch, cycle, demand, awaited, phase)
         if guard.tripped:
             return cycle
     return None
@@ -102,9 +131,9 @@ def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
 def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_its_axis():
     guard, axes, watch = make()
     # From cycle 3 on the actual stays at 9; the demand goes 3 counts a cycle: 12 counts, more than 11, at cycle 7,
-    # and that is held for three cycles.
+    # and that is held for five cycles.
     track = [(3 * n, min(3 * n, 9)) for n in range(20)]
-    assert run(watch, axes, guard, track) == 9
+    assert run(watch, axes, guard, track) == 11
     assert guard.tripped[0].condition is Condition.FROZEN_ACTUAL
     assert guard.reaction is Reaction.DISABLE
     assert guard.disabled == 0b10
@@ -112,14 +141,14 @@ def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_
 
 def test_an_axis_whose_demands_came_too_late_is_not_taken_for_frozen():
     guard, _, watch = make()
-    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 0)
+    check(watch, 0, phase=Phase.CAM)
     for cycle in range(1, 20):
         guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
-        watch.check(0, [0, 3 * cycle], 0.0, Phase.CAM, True, cycle)
+        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
     assert all(trip.condition is not Condition.FROZEN_ACTUAL for trip in guard.tripped)
     guard.clear(Condition.MISSED_DEADLINE, 0)
     for cycle in range(20, 30):
-        watch.check(0, [0, 3 * cycle], 0.0, Phase.CAM, True, cycle)
+        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
     assert guard.tripped[-1].condition is Condition.FROZEN_ACTUAL
 
 
@@ -137,7 +166,7 @@ def test_too_fast_is_judged_over_its_persistence_and_not_across_a_missed_tpdo():
     assert guard.tripped[0].value == 21
     guard, axes, watch = make()
     assert run(watch, axes, guard, [(20 * n, 20 * n) for n in range(100)]) is None
-    watch.check(0b10, [0, 0], 0.0, Phase.STANDSTILL, True, 0)
+    check(watch, 0, awaited=0b10)
     assert run(watch, axes, guard, [(5000 + 20 * n, 5000 + 20 * n) for n in range(100)]) is None
 
 
@@ -145,14 +174,14 @@ def test_torque_and_fault_and_following_error_are_told_with_their_values():
     guard, axes, watch = make()
     axes[0].torque = -2501
     for cycle in range(99):
-        watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, cycle)
+        check(watch, cycle)
     assert guard.tripped == []
-    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 99)
+    check(watch, 99)
     trip = guard.tripped.pop()
     assert (trip.condition, trip.axis, trip.value, trip.limit) == (Condition.TORQUE, "cv", -2501, 2500)
     axes[1].statusword = FAULT
     axes[1].actual = -301
-    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 100)
+    check(watch, 100)
     assert [(t.condition, t.axis, t.value) for t in guard.tripped] == [
         (Condition.DRIVE_FAULT, "servo", FAULT),
         (Condition.FOLLOWING_ERROR, "servo", 301),
@@ -162,15 +191,15 @@ def test_torque_and_fault_and_following_error_are_told_with_their_values():
 def test_one_silent_axis_is_told_from_a_silent_bus():
     guard, axes, watch = make()
     for cycle in range(5):
-        watch.check(0b01, [0, 0], 0.0, Phase.CAM, True, cycle)
+        check(watch, cycle, awaited=0b01, phase=Phase.CAM)
     assert [trip.condition for trip in guard.tripped] == [Condition.AXIS_SILENT]
     assert axes[0].silent_cycles == 5
     guard, axes, watch = make()
     for cycle in range(29):
-        watch.check(0b11, [0, 0], 0.0, Phase.CAM, True, cycle)
+        check(watch, cycle, awaited=0b11, phase=Phase.CAM)
     # The TPDOs are missed, of each axis; neither is silent alone.
     assert [trip.condition for trip in guard.tripped] == [Condition.MISSED_TPDO] * 2
-    watch.check(0b11, [0, 0], 0.0, Phase.CAM, True, 30)
+    check(watch, 30, awaited=0b11, phase=Phase.CAM)
     assert guard.tripped[-1].condition is Condition.BUS_OFF
     assert guard.reaction is Reaction.QUICK_STOP
 
@@ -179,12 +208,12 @@ def test_the_window_around_the_cam_and_the_end_effector():
     guard, axes, watch = make()
     # 20 deg are 227.6 counts: 228 trip it, and 50 mm are reached by no 19 deg of link s.
     axes[1].actual = -227
-    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 0)
+    check(watch, 0, phase=Phase.CAM)
     assert guard.tripped == []
     axes[1].actual = -228
-    watch.check(0, [0, 0], 0.0, Phase.STANDSTILL, True, 0)
+    check(watch, 0)
     assert guard.tripped == []
-    watch.check(0, [0, 0], 0.0, Phase.CAM, True, 1)
+    check(watch, 1, awaited=0, phase=Phase.CAM)
     assert [(trip.condition, trip.axis, trip.value, trip.limit) for trip in guard.tripped] == [
         (Condition.CAM_WINDOW, "", 228, 228)
     ]
@@ -252,7 +281,8 @@ def test_what_is_passed_over_changes_nothing_that_the_guard_says(limit_mm):
     random = np.random.default_rng(3)
     section = {"end_effector_error": PAPER.guard.end_effector_error.model_copy(update={"limit_mm": limit_mm})}
     config = PAPER.model_copy(update={"guard": PAPER.guard.model_copy(update=section)})
-    limits, window = guard_limits(config, slave_law(config, PROFILE))
+    window = guard_limits(config, slave_law(config, PROFILE))[1]
+    limits = [NO_LIMITS, NO_LIMITS]
     outcomes = []
     errors = np.rint(random.laplace(0.0, 60.0, (3000, 2))).astype(int)
     angles = random.uniform(0.0, math.tau, 3000)
@@ -265,8 +295,79 @@ def test_what_is_passed_over_changes_nothing_that_the_guard_says(limit_mm):
             for axis in axes:
                 axis.statusword = ENABLED
             axes[0].actual, axes[1].actual = -master, -slave
-            watch.check(0, [0, 0], angle, Phase.CAM, True, cycle)
+            watch.check(0, [0, 0], [0, 0], angle, Phase.CAM, True, 0, cycle)
             counts.append([guard.is_holding(one, 0) for one in (Condition.CAM_WINDOW, Condition.END_EFFECTOR_ERROR)])
         outcomes.append((counts, [(trip.at_ns, trip.condition, trip.value) for trip in guard.tripped]))
     assert outcomes[0] == outcomes[1]
     assert sum(row[1] for row in outcomes[0][0]) > 10
+
+
+def leap(back_after=None, counts=110):
+    """An axis that goes 4 counts a cycle, and leaps in cycle 10."""
+    return [(4 * n, 4 * n + (counts if 10 <= n < (back_after or 1000) else 0)) for n in range(40)]
+
+
+def test_a_leap_that_stays_is_too_fast_and_a_glitch_that_goes_back_is_not():
+    # 20.5 counts a cycle, held for five: after five cycles the axis could have gone 102.5, and it is 110 + 4 * 4 away.
+    for track, tripped in ((leap(), 14), (leap(counts=-150), 14), (leap(11), None), (leap(13), None)):
+        guard, axes, watch = make()
+        assert run(watch, axes, guard, track) == tripped
+        assert not tripped or guard.tripped[0].condition is Condition.VELOCITY
+    guard, axes, watch = make()
+    # 80 counts more than 4 a cycle are within reach in five cycles.
+    assert run(watch, axes, guard, leap(counts=80)) is None
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    torque_a_cycle: int
+    offset_a_cycle: int = 0
+    count_at: int = 1000
+    tripped_at: int | None = None
+
+
+@pytest.mark.parametrize(
+    "push",
+    [
+        # Standing since cycle 0, its torque looked at from cycle 16 on: 260 more, above 250, at 42; held for 8 cycles.
+        Push(10, tripped_at=42 + 7),
+        Push(-10, tripped_at=42 + 7),
+        # 7 of 10 are foreseen: 3 a cycle are above 250 from 84 cycles on.
+        Push(10, 7, tripped_at=16 + 84 + 7),
+        Push(10, 10),
+        # The offset takes the load over from the controller.
+        Push(0, 10),
+        # One count in cycle 40 begins the standing anew.
+        Push(10, count_at=40, tripped_at=40 + 16 + 26 + 7),
+    ],
+)
+def test_torque_that_grows_while_not_a_count_comes_of_it(push):
+    guard, axes, watch = make()
+    for cycle in range(300):
+        axes[1].actual = int(cycle >= push.count_at)
+        axes[1].torque = push.torque_a_cycle * min(cycle, 200)
+        check(watch, cycle, offset=push.offset_a_cycle * min(cycle, 200))
+        if guard.tripped:
+            assert guard.tripped[0].condition is Condition.UNANSWERED_TORQUE
+            assert (cycle, guard.disabled) == (push.tripped_at, 0b10)
+            return
+    assert push.tripped_at is None
+    assert STILL_CYCLES == 16
+
+
+def test_an_axis_apart_from_its_cam_may_be_pushed():
+    guard, axes, watch = make()
+    watch._cam.law.is_plain = False
+    for cycle in range(200):
+        axes[1].torque = 10 * cycle
+        check(watch, cycle)
+    assert not guard.tripped
+
+
+@pytest.mark.parametrize(("followers", "tripped"), [(0b10, True), (0, False), (0b01, False)])
+def test_a_resolver_that_dies_in_a_coupled_stop_takes_the_torque_from_the_follower_alone(followers, tripped):
+    guard, _, watch = make()
+    for cycle in range(20):
+        check(watch, cycle, 3 * cycle, is_enabled=False, followers=followers)
+    assert [trip.condition for trip in guard.tripped] == [Condition.FROZEN_ACTUAL] * tripped
+    assert guard.disabled == 0b10 * tripped
