@@ -283,7 +283,7 @@ def test_a_cam_that_starts_elsewhere_is_refused():
 
 
 def test_missed_tpdos_stop_the_machine_on_the_cam():
-    patient = changed(("axis_silent: {persistence_cycles: 5", "axis_silent: {persistence_cycles: 1000"))
+    patient = changed(("axis_silent: {persistence_cycles: 5", "axis_silent: {persistence_cycles: 199"))
     session = Session(patient, cycles=5, faults=Dropping(SERVO_TPDO, 3 * SECOND, 50_000_000)).to_end()
     assert session.core.stopped_by is StopReason.MISSED_TPDO
     assert [(trip.condition.value, trip.axis) for trip in session.trips] == [("missed_tpdo", "servo")]

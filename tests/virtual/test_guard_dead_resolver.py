@@ -44,7 +44,7 @@ def test_a_servo_resolver_that_dies_in_a_quick_stop_takes_its_torque(after_s):
     run.to_end()
     assert [trip.condition for trip in run.trips] == [Condition.FROZEN_ACTUAL]
     assert not run.is_torn
-    assert math.degrees(run.strain(2.71).cam_distance_rad) < 5.0
+    assert math.degrees(run.strain(2.71).cam_distance_rad) < 8.0
 
 
 @pytest.mark.parametrize(
