@@ -12,8 +12,9 @@ from mechanism.jit import kernel
 
 Float = NDArray[np.float64]
 
+COARSE_GRID: Final = 90
 GRID: Final = 720
-"""Angles of the master at which a box of errors is looked at."""
+"""Angles of the master at which a box of errors is looked at: to find one, and to be sure of it."""
 SAFETY: Final = 1.5
 """A box of errors is harmless where it stays this much below the limits on the grid."""
 MAXIMUM_TRIALS: Final = 64
@@ -36,16 +37,16 @@ def end_effector_miss(
 
 @kernel
 def greatest_deviation(
-    geometry: Float, closure: int, coefficients: Float, net_turns: int, error: float
+    geometry: Float, closure: int, coefficients: Float, net_turns: int, error: float, grid: int
 ) -> tuple[float, float]:
     """The farthest that errors of ``error`` (rad) either way on either axis take a five-bar on its cam from there.
 
     Slave from the cam of the master's actual angle (rad), and `end_effector_miss` (m), over one turn of the master; inf
-    where the linkage does not close.
+    where the linkage does not close. ``grid`` angles of the master are looked at.
     """
     window = miss = 0.0
-    for step in range(GRID):
-        theta2 = step * (tau / GRID)
+    for step in range(grid):
+        theta2 = step * (tau / grid)
         theta5 = evaluate(coefficients, net_turns, theta2)[0]
         for sign2 in range(-1, 2):
             error2 = sign2 * error
@@ -67,10 +68,13 @@ def harmless_error(
     ``window`` (rad) and ``miss`` (m) are the limits of what `greatest_deviation` returns; a third of them is kept free
     for what lies between the angles that are looked at.
     """
-    error = window
+    error, grid = window, COARSE_GRID
     for _ in range(MAXIMUM_TRIALS):
-        far, away = greatest_deviation(geometry, closure, coefficients, net_turns, error)
-        if far * SAFETY <= window and away * SAFETY <= miss:
+        far, away = greatest_deviation(geometry, closure, coefficients, net_turns, error, grid)
+        if not (far * SAFETY <= window and away * SAFETY <= miss):
+            error *= SHRINKAGE
+        elif grid == GRID:
             return error
-        error *= SHRINKAGE
+        else:
+            grid = GRID
     return 0.0

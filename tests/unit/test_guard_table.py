@@ -273,7 +273,7 @@ def test_a_linkage_that_cannot_be_off_by_a_count_has_no_harmless_error():
     assert 0.0 < small < math.radians(0.1)
     assert harmless_error(*arguments, window.window_rad, 0.0) == 0.0
     apart = np.array([1.0, 1.0, 1.0, 1.0, 5.0, *window.geometry[5:]])
-    assert greatest_deviation(apart, *arguments[1:], 0.01)[1] == math.inf
+    assert greatest_deviation(apart, *arguments[1:], 0.01, 90)[1] == math.inf
 
 
 @pytest.mark.parametrize("limit_mm", [50.0, 12.0])

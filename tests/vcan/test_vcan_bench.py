@@ -90,6 +90,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
     # A cycle that is lost on the way is 16 counts of travel here.
     config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
+    config["guard"]["unanswered_torque"] = {"limit_permille": 30000, "reaction": "disable"}
     path = tmp_path_factory.mktemp("bench") / "bench.yaml"
     path.write_text(yaml.safe_dump(config))
     return path

@@ -23,6 +23,7 @@ TOO_SLOW = {
     "missed_deadline",
     "axis_silent",
     "frozen_actual",
+    "unanswered_torque",
     "sync_lost",
     "bus_off",
     "emergency",
