@@ -160,6 +160,8 @@ def _document(rpm: int, curve: Path, is_learning: bool, is_torque_controlled: bo
     if is_torque_controlled:
         for name, gains in TORQUE_LOOPS.items():
             document["axes"][name]["position_loop"] = gains
+        # These loops are softer than the drives': friction keeps the servo axis where it stands for up to 4 counts.
+        document["guard"]["frozen_actual"]["limit_deg"] = 0.5
     return document
 
 
