@@ -17,8 +17,9 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(240)]
 
 WATCHED_CYCLES = 250
 """A second of them before a death, and one after it."""
-NOISE_CYCLES = 50
-"""So many may differ on a busy computer."""
+NOISE_CYCLES = 25
+"""So many more may be amiss on a busy computer; on one that keeps up none is, before or after."""
+CYCLE_NS = 4_000_000
 
 
 @pytest.fixture
@@ -33,20 +34,23 @@ def begin(start_own_sim_drive, tmp_path):
     return begin
 
 
-def assert_account_goes_on(run, killed_at):
-    """The cycle's own account around sample number ``killed_at``: no cycle is lost, and no more goes wrong than before.
+def amiss(samples):
+    """What the cycle's own account says of these samples: flags, and cycles for which there was no SYNC."""
+    span_ns = int(samples["sync_ns"][-1] - samples["sync_ns"][0])
+    return count_cycles(samples, 2).total + round(span_ns / CYCLE_NS) - (len(samples) - 1)
 
-    All that is asked of a cycle's time is that the death does not show in it.
+
+def assert_account_goes_on(run, killed_at):
+    """Around sample number ``killed_at`` no sample is lost, and no more is amiss than before.
+
+    All that is asked of the cycle's time is that the death does not show in it.
     """
     before = np.array(run.samples[killed_at - WATCHED_CYCLES : killed_at])
     after = np.array(run.samples[killed_at : killed_at + WATCHED_CYCLES])
     assert len(before) == len(after) == WATCHED_CYCLES
-    cycles = np.concatenate([before["cycle"], after["cycle"]])
-    assert (np.diff(cycles) == 1).all(), "a cycle has no sample"
+    assert (np.diff(np.concatenate([before["cycle"], after["cycle"]])) == 1).all(), "a cycle has no sample"
     assert set(after["phase"]) == {Phase.CAM}
-    counts = [count_cycles(part, 2) for part in (before, after)]
-    assert counts[1].total <= counts[0].total + NOISE_CYCLES, counts
-    assert counts[1].bus_errors == counts[1].send_buffer_full == 0
+    assert amiss(after) <= amiss(before) + NOISE_CYCLES
 
 
 def test_a_killed_monitor_does_not_touch_the_cycle(begin, tmp_path):
