@@ -32,7 +32,7 @@ MACHINE = 0
 """In place of a node: the condition is not one axis'."""
 LEAST_SINE = 0.79
 """The cam's own least sine is 0.80."""
-LEAST_SINE_LYING = 0.75
+LEAST_SINE_LYING = 0.78
 """A resolver that jumps has its drive carry the link as far before anybody can know."""
 
 
@@ -110,12 +110,6 @@ def cases_of_axis(node: int) -> dict[Condition, Case]:
                 ("limit_permille: 2500, persistence_cycles: 100", "limit_permille: 2500, persistence_cycles: 25"),
                 ("limit_permille: 250, persistence_cycles: 8", "limit_permille: 30000, persistence_cycles: 8"),
             ),
-        ),
-        Condition.FROZEN_ACTUAL: Case(
-            StopReason.FROZEN_ACTUAL,
-            (StopReason.FROZEN_ACTUAL,) * 4,
-            Kind.LOST,
-            lambda at_s: (Fault(FaultKind.FROZEN_RESOLVER, node, at_s),),
         ),
         Condition.MISSED_TPDO: Case(
             StopReason.MISSED_TPDO,
@@ -298,8 +292,10 @@ def check(condition: Condition, node: int, moment: str) -> None:
 
 def test_no_condition_is_left_out():
     nodes = {condition: {node for other, node in CASES if other is condition} for condition in Condition}
-    # In motion another condition is there before it, and at rest it is in test_guard_dead_resolver.
-    nodes[Condition.UNANSWERED_TORQUE] = {CV, SERVO}
+    # Which of the two it is that notices a dead resolver is a matter of the instant: test_guard_frozen_resolver.
+    dead = {Condition.FROZEN_ACTUAL, Condition.UNANSWERED_TORQUE}
+    assert dead.isdisjoint(condition for condition, _ in CASES)
+    nodes |= {condition: {CV, SERVO} for condition in dead}
     assert nodes == {condition: {MACHINE} if condition in OF_THE_MACHINE else {CV, SERVO} for condition in Condition}
     assert tuple(moments()) == MOMENTS
 
@@ -320,10 +316,7 @@ SAMPLE = {
     [
         pytest.param(
             *cell,
-            marks=[
-                *([] if cell in SAMPLE else [pytest.mark.slow]),
-                *([pytest.mark.xfail(strict=False)] if cell[0] is Condition.FROZEN_ACTUAL else []),
-            ],
+            marks=[] if cell in SAMPLE else pytest.mark.slow,
             id="-".join((cell[0].value, AXIS_NAMES[cell[1]] or "machine", cell[2])),
         )
         for cell in ((*key, moment) for key in CASES for moment in MOMENTS)
