@@ -212,10 +212,10 @@ class GuardSection(Model):
                 "another (bound: below 180)"
             )
         travel = self.frozen_actual.limit_deg / 360.0 * counts_per_revolution
-        if travel >= gateway_counts:
+        if travel >= drive_counts:
             raise ValueError(
                 f"guard.frozen_actual.limit_deg: {self.frozen_actual.limit_deg:g} can never trip, the following error "
-                f"of axis {name} does so first (bound {gateway_counts * 360.0 / counts_per_revolution:.3g})"
+                f"of axis {name} does so first (bound {drive_counts * 360.0 / counts_per_revolution:.3g})"
             )
 
     def check_end_effector(self, reach_mm: float, counts_per_revolution: int) -> None:

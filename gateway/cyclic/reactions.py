@@ -23,6 +23,9 @@ BLEND_S: Final = 0.02
 """Within this the slave's target goes over from the demand that was to the cam of the actual position."""
 STANDSTILL_S: Final = 0.05
 STANDSTILL_COUNTS: Final = 2
+WATCHED_S: Final = 0.1
+"""So long a master takes that brakes; behind one that runs out, dry friction holds a slave for longer than a resolver
+may be still."""
 POSITION_GAIN: Final = 0.7
 VELOCITY_GAIN: Final = 0.4
 """Of the observer of the master: shares of the difference to the actual position, the second one per cycle."""
@@ -46,6 +49,7 @@ class CoupledStop:
         self._rad_per_count = math.tau / self._master.units.counts_per_revolution
         self._blend_cycles = max(round(BLEND_S / period_s), 1)
         self._standstill_cycles = max(round(STANDSTILL_S / period_s), 1)
+        self._watched_cycles = round(WATCHED_S / period_s)
         self._cycle = 0
         self._offset = 0
         self._turns = 0
@@ -117,8 +121,9 @@ class CoupledStop:
 
     @property
     def followers(self) -> int:
-        """Bit n: axis n follows its targets still."""
-        return 0 if self.is_finished or self._slave.controlword == COMMAND_QUICK_STOP else 1 << SLAVE
+        """Bit n: axis n follows its targets still, and shows it."""
+        is_over = self.is_finished or self._cycle > self._watched_cycles
+        return 0 if is_over or self._slave.controlword == COMMAND_QUICK_STOP else 1 << SLAVE
 
     def controlled_stop(self) -> None:
         """Nothing: this is a stop, and a stronger one."""

@@ -37,8 +37,6 @@ class AxisLimits:
 
 
 NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX)
-FOLLOWER_SHARE: Final = 2
-"""So much more than in a run may the demand of an axis go unanswered that follows another one in a stop."""
 STILL_CYCLES: Final = 16
 """So long after its last count an axis' torque is what its standing takes: a count is a blow to a controller."""
 
@@ -216,7 +214,7 @@ class CycleWatch:
         ):
             self._check_drive(number, watched, now_ns)
             self._check_velocity(number, watched, moved, now_ns)
-            if self._check_answer(number, watched, target, moved, watched.frozen_counts, now_ns):
+            if self._check_answer(number, watched, target, moved, now_ns):
                 self._check_push(number, watched, torque_offset, now_ns)
         else:
             watched.travelled = watched.still_cycles = 0
@@ -225,10 +223,10 @@ class CycleWatch:
         watched.is_fresh = True
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
-        """A resolver that dies in a stop is as bad as in a run; without its torque offsets an axis lags more there."""
+        """A resolver that dies in a stop is as bad as in a run."""
         actual = watched.axis.actual
         moved = (actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-        self._check_answer(number, watched, target, moved, FOLLOWER_SHARE * watched.frozen_counts, now_ns)
+        self._check_answer(number, watched, target, moved, now_ns)
         watched.actual = actual
         watched.target = target
         watched.is_fresh = True
@@ -269,10 +267,8 @@ class CycleWatch:
             return
         guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
 
-    def _check_answer(
-        self, number: int, watched: _WatchedAxis, target: int, moved: int, limit: int, now_ns: int
-    ) -> bool:
-        """Whether an axis that is asked to go ``limit`` counts shows anything of it; returns whether it stands."""
+    def _check_answer(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> bool:
+        """Whether an axis that is asked to move shows anything of it; returns whether it stands on one count."""
         guard = self._guard
         if not watched.is_fresh or moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
             # A drive that has had no new target stands, whatever its resolver shows.
@@ -286,8 +282,8 @@ class CycleWatch:
             return False
         travel = (target - watched.target + HALF_RANGE & RANGE_MASK) - HALF_RANGE
         watched.travelled += travel if travel > 0 else -travel
-        if watched.travelled > limit:
-            guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, limit, now_ns)
+        if watched.travelled > watched.frozen_counts:
+            guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
         return True
 
     def _check_push(self, number: int, watched: _WatchedAxis, torque_offset: int, now_ns: int) -> None:

@@ -51,8 +51,8 @@ class Refusal:
         Refusal(
             "limit_deg: 20", "limit_deg: 0.17", "guard.cam_window.limit_deg: 0.17 would always trip, it is less than 2"
         ),
-        Refusal("limit_deg: 0.25", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
-        Refusal("limit_deg: 0.25", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
+        Refusal("limit_deg: 0.45", "limit_deg: 0.1", "guard.frozen_actual.limit_deg: 0.1 would always trip"),
+        Refusal("limit_deg: 0.45", "limit_deg: 18", "18 can never trip, the following error of axis cv does so first"),
         Refusal("limit_mm: 50", "limit_mm: 800", "can never trip, the linkage reaches 400 mm (bound: below 800)"),
         Refusal("limit_mm: 50", "limit_mm: 1", "would always trip, the resolvers tell the end effector to 1.2 mm"),
         Refusal(
@@ -77,11 +77,6 @@ class Refusal:
             "following_error_counts: 200",
             "following_error_counts: 200\n      guarded_error_counts: 1",
             "axes.cv.limits: a following error of 1 counts would always trip",
-        ),
-        Refusal(
-            "following_error_counts: 200",
-            "following_error_counts: 200\n      guarded_error_counts: 2",
-            "guard.frozen_actual.limit_deg: 0.25 can never trip, the following error of axis cv does so first",
         ),
         Refusal(
             "sigterm: {reaction: controlled_stop}", "sigterm: {reaction: warn}", "warn would leave the machine running"
@@ -131,9 +126,9 @@ def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
 def test_a_frozen_actual_value_trips_after_its_travel_and_takes_the_torque_from_its_axis():
     guard, axes, watch = make()
     # From cycle 3 on the actual stays at 9; the demand goes 3 counts a cycle: 12 counts, more than 11, at cycle 7,
-    # and that is held for five cycles.
+    # and that is held for four cycles.
     track = [(3 * n, min(3 * n, 9)) for n in range(20)]
-    assert run(watch, axes, guard, track) == 11
+    assert run(watch, axes, guard, track) == 10
     assert guard.tripped[0].condition is Condition.FROZEN_ACTUAL
     assert guard.reaction is Reaction.DISABLE
     assert guard.disabled == 0b10

@@ -19,9 +19,9 @@ FROZEN = (Condition.FROZEN_ACTUAL, Condition.UNANSWERED_TORQUE)
         (SERVO, 0.20, 50.0),
         (CV, 0.20, 2.0),
         pytest.param(SERVO, 0.26, 50.0, marks=pytest.mark.slow, id="start of the ramp"),
-        pytest.param(SERVO, 0.50, 12.0, marks=pytest.mark.slow, id="slow servo"),
-        pytest.param(SERVO, 4.20, 4.0, marks=pytest.mark.slow, id="end of the ramp down"),
-        pytest.param(SERVO, 4.25, 30.0, marks=pytest.mark.slow, id="last degree"),
+        pytest.param(SERVO, 0.50, 15.0, marks=pytest.mark.slow, id="slow servo"),
+        pytest.param(SERVO, 4.20, 7.0, marks=pytest.mark.slow, id="end of the ramp down"),
+        pytest.param(SERVO, 4.25, 60.0, marks=pytest.mark.slow, id="last degree"),
         pytest.param(CV, 4.30, 2.0, marks=pytest.mark.slow, id="last degree of the master"),
     ],
 )

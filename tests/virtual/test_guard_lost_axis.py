@@ -32,7 +32,7 @@ IDLE = changed(
         "limit_permille: 2500, persistence_cycles: 100, reaction: controlled_stop",
         "limit_permille: 2500, reaction: warn",
     ),
-    ("persistence_cycles: 5, reaction: disable", "persistence_cycles: 3, reaction: warn"),
+    ("persistence_cycles: 4, reaction: disable", "persistence_cycles: 3, reaction: warn"),
     ("persistence_cycles: 20, reaction: controlled_stop", "reaction: warn"),
     ("limit_cycles: 20, reaction: quick_stop", "limit_cycles: 20, reaction: warn"),
 )
