@@ -9,7 +9,7 @@ from gateway.cyclic.guard import Condition, StopReason
 from gateway.record.sample import Phase
 from sim_drive.injection.faults import Fault, FaultKind
 
-LEAST_SINE, BOUND_RAD = 0.79, math.radians(10.0)
+LEAST_SINE, BOUND_RAD = 0.79, math.radians(15.0)
 """Where the demand tells: the cam's own least sine is 0.80."""
 SLOW_RAD_PER_S = 0.05
 """Half a count in 15 ms: of an axis that is asked for less, only what its torque does tells."""
