@@ -37,8 +37,9 @@ class AxisLimits:
 
 
 NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX)
-STILL_CYCLES: Final = 16
-"""So long after its last count an axis' torque is what its standing takes: a count is a blow to a controller."""
+STILL_CYCLES: Final = (8, 16, 24)
+"""So long after its last count an axis' torque is looked at, and the middle one taken for what its standing takes: a
+count of the demand, or of the resolver's noise, is a blow to a controller, and may hit one of them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,8 +70,7 @@ class _WatchedAxis:
         "leap_cycles",
         "settling",
         "still_cycles",
-        "still_offset",
-        "still_torque",
+        "still_torques",
         "target",
         "torque",
         "travelled",
@@ -96,9 +96,8 @@ class _WatchedAxis:
         self.leap_cycles = 0
         self.still_cycles = 0
         """Cycles since the actual value changed last."""
-        self.still_torque = 0
-        """Torque actual value when the axis had just come to stand, and the torque offset then."""
-        self.still_offset = 0
+        self.still_torques = [(0, 0)] * len(STILL_CYCLES)
+        """Torque actual value and torque offset then."""
         self.is_fresh = False
         """The actual value of the cycle before is known."""
 
@@ -290,12 +289,17 @@ class CycleWatch:
         """Whether an axis that stands on one count is pushed more and more."""
         guard, torque = self._guard, watched.axis.torque
         watched.still_cycles += 1
-        if watched.still_cycles <= STILL_CYCLES:
-            watched.still_torque, watched.still_offset = torque, torque_offset
+        still = watched.still_torques
+        if watched.still_cycles <= STILL_CYCLES[-1]:
+            if watched.still_cycles in STILL_CYCLES:
+                still[STILL_CYCLES.index(watched.still_cycles)] = torque, torque_offset
+                if watched.still_cycles == STILL_CYCLES[-1]:
+                    still.sort()
             return
-        pushed = torque - watched.still_torque
+        still_torque, still_offset = still[len(still) // 2]
+        pushed = torque - still_torque
         # Neither a load that the offset foresees is a push, nor an offset that takes a load over from the controller.
-        unforeseen = pushed - (torque_offset - watched.still_offset)
+        unforeseen = pushed - (torque_offset - still_offset)
         push = min(abs(pushed), abs(unforeseen))
         if push > watched.unanswered and self._is_plain():
             guard.hold(Condition.UNANSWERED_TORQUE, number, push, watched.unanswered, now_ns)
