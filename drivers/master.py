@@ -322,7 +322,3 @@ class Master:
         booted = yield from self.wait_for(lambda: node.boot_ups > before, timeout_s)
         if not booted:
             raise NoAnswerError(node_id, "its boot-up message", timeout_s)
-
-
-IDENTITY_SUBINDICES: Final = {"vendor id": 1, "product code": 2, "revision number": 3, "serial number": 4}
-"""Sub-indices of the identity object, by their names in CiA 301."""

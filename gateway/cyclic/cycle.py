@@ -8,9 +8,9 @@ its actual position. So the following error of cycle k compares the target that 
 value latched at SYNC(k): both belong to the same instant.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from operator import attrgetter
-from typing import Final, Protocol
+from typing import Final
 
 from config.guard_section import Reaction
 from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
@@ -22,6 +22,7 @@ from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.demand import Demand
 from gateway.cyclic.guard import Condition, Guard
 from gateway.cyclic.lateness import Late
+from gateway.cyclic.listeners import ErrorObserver, LateListener, SampleSink
 from gateway.cyclic.position_loop import PositionLoop
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
@@ -29,7 +30,7 @@ from gateway.record.lateness import LateKind
 from gateway.record.sample import INT32_MAX, MISSED_TPDO_MASK, Phase, SampleFlag, saturate_int32
 from gateway.units import HALF_RANGE, RANGE_MASK
 
-__all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop", "SampleSink"]
+__all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop"]
 
 RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
 """Controlword, target position, torque offset."""
@@ -60,37 +61,6 @@ _pack_rpdo: Final = RPDO_LAYOUT.pack
 _TPDO_LENGTH: Final = TPDO_LAYOUT.length
 _COMMISSIONING: Final = Phase.COMMISSIONING
 _CAM: Final = Phase.CAM
-
-
-class SampleSink(Protocol):
-    """Where the cycle's samples go: the shared-memory ring, or a list in virtual time."""
-
-    def append(self, *values: float) -> None:
-        """Take one sample, the values in the order of ``SampleLayout.pack_into``."""
-        ...
-
-
-class LateListener(Protocol):
-    """Who is told of what was late."""
-
-    def missed(self, late: Late) -> None:
-        """A demand was not on the bus before its SYNC, or a SYNC was a cycle late."""
-        ...
-
-    def demand_is_out(self, at_ns: int) -> None:
-        """The demand that was told as missed before it was on the bus was there at this time."""
-        ...
-
-
-class ErrorObserver(Protocol):
-    """Who is shown the following errors in motion, before the next demand is taken; not those of a missed TPDO."""
-
-    def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
-        """Errors in counts, one an axis, and the master's demand (rad, rad/s) for the instant at which they were.
-
-        ``is_steady``: the machine is at speed on the cam, and nothing that is guarded is amiss.
-        """
-        ...
 
 
 _Sent = tuple[float, float, list[float], list[int], list[int], Phase]
@@ -560,10 +530,6 @@ class CyclicLoop:
         ]
         is_steady = phase is _CAM and self.guard.is_quiet
         observer.observe(position, velocity, errors, is_steady)
-
-    def _hold_cycles(self, condition: Condition, number: int, now_ns: int) -> None:
-        cycles = self.guard.persistence(condition)
-        self.guard.hold(condition, number, cycles, cycles, now_ns)
 
     def react(self) -> None:
         """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""

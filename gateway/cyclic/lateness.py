@@ -61,8 +61,6 @@ class Spell:
     major_faults: int
     bus_ns: int
     """Waiting for a bus that was full."""
-    stood_still_ns: int
-    """A witness was not woken for so long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +86,6 @@ class Evidence:
     """Waiting for TPDOs beyond the phase."""
     sync_ns: int = 0
     """By how much SYNC(k) was early, and the cycle too short."""
-    stood_still_ns: int = 0
-    """A witness was not woken for so long."""
 
     @property
     def awake_off_ns(self) -> int:
@@ -103,11 +99,6 @@ def _woken_late(seen: Evidence) -> int:
 
 def _stolen(seen: Evidence) -> int:
     return 0 if seen.extra_switches or seen.major_faults else seen.awake_off_ns
-
-
-def _stood_still(seen: Evidence) -> int:
-    told = min(seen.ready_ns, seen.off_ns) + _woken_late(seen) + _stolen(seen)
-    return max(0, seen.stood_still_ns - told)
 
 
 def _page_fault(seen: Evidence) -> int:
@@ -126,7 +117,6 @@ TABLE: Final[tuple[tuple[Cause, Callable[[Evidence], int]], ...]] = (
     (Cause.BUS_FULL, lambda seen: seen.bus_ns),
     (Cause.WOKEN_LATE, _woken_late),
     (Cause.STOLEN, _stolen),
-    (Cause.STOOD_STILL, _stood_still),
     (Cause.PAGE_FAULT, _page_fault),
     (Cause.OWN_CALL, _own_call),
     (Cause.OWN_WORK, lambda seen: max(0, seen.own_excess_ns - seen.own_overload_ns)),
@@ -211,5 +201,4 @@ def evidence(late: Late, sent_ns: int, spell: Spell | None, cycle: CycleShape) -
         bus_ns=spell.bus_ns + on_bus_ns,
         drives_ns=drives_ns,
         sync_ns=short_ns + early_ns,
-        stood_still_ns=spell.stood_still_ns,
     )

@@ -35,8 +35,6 @@ class Cause(Enum):
     """It slept on beyond its time without being ready: a late timer, an idle state, a host that was away."""
     STOLEN = "stolen"
     """It had the processor by the kernel's account, and got no time: the host ran something else."""
-    STOOD_STILL = "stood_still"
-    """A witness beside the loop, which only sleeps, was not woken either."""
     SYNC_IRREGULAR = "sync_irregular"
     """By the kernel's stamps SYNC was early, or the cycle short."""
     DRIVES_LATE = "drives_late"
@@ -57,7 +55,6 @@ IN_WORDS: Final[Mapping[Cause, str]] = {
     Cause.ANOTHER_PROCESS: "another process had the processor",
     Cause.WOKEN_LATE: "woken late",
     Cause.STOLEN: "stolen by the host",
-    Cause.STOOD_STILL: "the machine stood still",
     Cause.SYNC_IRREGULAR: "SYNC irregular",
     Cause.DRIVES_LATE: "drives late",
     Cause.BUS_FULL: "bus full",
@@ -71,7 +68,6 @@ OUTSIDE: Final = frozenset(
         Cause.ANOTHER_PROCESS,
         Cause.WOKEN_LATE,
         Cause.STOLEN,
-        Cause.STOOD_STILL,
         Cause.SYNC_IRREGULAR,
         Cause.DRIVES_LATE,
         Cause.BUS_FULL,

@@ -386,11 +386,6 @@ def _velocity(data: RunData, axis: int, valid: BoolArray, span: int) -> tuple[ND
     return np.flatnonzero(usable) + span // 2, velocity[usable]
 
 
-def smoothed_velocity(data: RunData, axis: int) -> tuple[NDArray[np.intp], FloatArray]:
-    """The actual velocity of an axis, counts/s, over ``SMOOTHING_CYCLES``, and the samples that it belongs to."""
-    return _velocity(data, axis, data.is_following & data.is_valid[:, axis], SMOOTHING_CYCLES)
-
-
 def cycle_figures(data: RunData) -> CycleFigures:
     """The timing of the cycle over every sample."""
     samples = data.samples

@@ -7,9 +7,11 @@ from typing import Final
 from config.conversion import closure_at_home, desired_curve, five_bar
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
-from gateway.cyclic.cycle import AxisChannel, CyclicLoop, SampleSink
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.guard import Guard
+from gateway.cyclic.listeners import SampleSink
 from gateway.cyclic.operation import Operation
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.torque_offsets import build_torque_offsets

@@ -20,7 +20,8 @@ from drivers.pdo import RPDO_BASE
 from drivers.period_trim import PeriodTrim
 from drivers.ports import Port
 from drivers.sdo import SDO_RESPONSE_BASE
-from gateway.cyclic.cycle import CyclicLoop, LateListener
+from gateway.cyclic.cycle import CyclicLoop
+from gateway.cyclic.listeners import LateListener
 from gateway.record.sample import SampleFlag
 from gateway.running.controller_watch import ControllerWatch
 from gateway.running.core import GatewayCore

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.lateness import CycleShape, Late, Spell, explain
@@ -86,14 +86,6 @@ def major_faults() -> int:
     return resource.getrusage(resource.RUSAGE_THREAD).ru_majflt
 
 
-class Witness(Protocol):
-    """Who knows when this machine stood still."""
-
-    def stood_still_ns(self, begin_ns: int, end_ns: int) -> int:
-        """For how long of this time."""
-        ...
-
-
 class _Pending:
     """A late demand of which not everything is known yet."""
 
@@ -120,7 +112,6 @@ class LateAccountant:
         *,
         is_echoed: bool = False,
         is_fine: bool = True,
-        witness: Witness | None = None,
         trace: WakeTrace | None = None,
         counters: Callable[[], bytes] | None = None,
         processor_ns: Callable[[], int] = time.thread_time_ns,
@@ -137,7 +128,6 @@ class LateAccountant:
         self._tell = tell
         self._is_echoed = is_echoed
         self._is_fine = is_fine
-        self._witness = witness
         self._trace = trace
         self._counters = counters if is_fine else None
         self._processor_ns = processor_ns
@@ -318,7 +308,6 @@ class LateAccountant:
             # One for the wake itself, one for each wait for the bus.
             switches = max(0, int(now[2]) - int(before[2]) - 1 - self._refusals)
         faults = self._faults()
-        stood_still_ns = 0 if self._witness is None else self._witness.stood_still_ns(self._planned_ns, now_ns)
         spell = Spell(
             planned_ns=self._planned_ns,
             woke_ns=self._woke_ns,
@@ -330,7 +319,6 @@ class LateAccountant:
             extra_switches=switches,
             major_faults=faults - self._faults_before,
             bus_ns=self._bus_ns,
-            stood_still_ns=stood_still_ns,
         )
         self._faults_before = faults
         if self._pending:

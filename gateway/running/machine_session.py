@@ -272,8 +272,9 @@ class MachineSession:
         if loop.phase is not Phase.QUICK_STOP:
             yield from self.master.pause(SETTLE_S)
             # Guarded until the end; but a wish to stop that comes now finds the run completed.
-            if guard.stopped_by not in {None, StopReason.OPERATOR}:
-                self.stopped_by = guard.stopped_by
+            reason = guard.stopped_by
+            if reason is not None and reason is not StopReason.OPERATOR:
+                self.stopped_by = reason
         if self.stopped_by is StopReason.COMPLETED and not demand.law.is_plain:
             self._step("the slave ends off its cam: give the next run --from-here")
         if loop.phase is Phase.QUICK_STOP:

@@ -345,10 +345,3 @@ def raised(gains: Float, factors: Sequence[float]) -> Float:
 def decibel(ratio: float) -> float:
     """20 log10 of a ratio."""
     return 20.0 * log10(ratio)
-
-
-def positions_of(model: LoopModel, mask: Bool) -> LoopModel:
-    """The same loop at some of its positions alone, for a search that looks at the worst ones."""
-    return LoopModel(
-        model.theta2[mask], model.axes, model.a[mask], model.b[mask], model.frequencies_hz, model.response[mask]
-    )

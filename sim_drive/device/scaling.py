@@ -26,11 +26,6 @@ class Scaling:
     position_unit: float = 1.0
     velocity_unit: float = 1.0
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether user units are counts."""
-        return self.position_unit == 1.0 and self.velocity_unit == 1.0
-
     def position(self, counts: int) -> int:
         """``counts`` in whole user units, rounded to the nearest; without any offset and wrap."""
         return (2 * counts * self.numerator + self.denominator) // (2 * self.denominator)

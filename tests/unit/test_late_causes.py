@@ -27,7 +27,6 @@ QUIET = Spell(
     extra_switches=0,
     major_faults=0,
     bus_ns=0,
-    stood_still_ns=0,
 )
 
 
@@ -51,8 +50,6 @@ ROWS = {
     Cause.WOKEN_LATE: (LATE, spell(1400, woke_us=1300, extra_switches=0), True),
     # 1.1 ms awake, of which the kernel says that 0.1 ms were its own and that it was never off the processor.
     Cause.STOLEN: (LATE, spell(1400), True),
-    # 1.1 ms of "own" time, but a witness beside it stood still for 1 ms of it.
-    Cause.STOOD_STILL: (LATE, spell(1400, processor_us=1100, stood_still_us=1000), True),
     # SYNC(k+1) came 0.6 ms after SYNC(k): 0.4 ms were missing.
     Cause.SYNC_IRREGULAR: (replace(LATE, deadline_ns=600 * US), spell(1000, processor_us=700), True),
     # It waited for a TPDO until 0.9 ms; 0.5 ms of work then end at 1.4 ms.
