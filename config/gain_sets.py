@@ -13,6 +13,8 @@ from config.schema import GatewayConfig
 
 LOOSE_FROZEN_DEG: Final = 3.0
 """How far the demand of an axis with such gains may go while the axis stands."""
+LOOSE_UNANSWERED_PERMILLE: Final = 1000
+"""How far its torque may change meanwhile."""
 
 
 class GainSet(Model):
@@ -39,7 +41,8 @@ def load_gain_sets(name: str) -> Mapping[str, GainSet]:
 def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
     """``config`` with these gains in its emulated drives and nothing that helps the controller; its text says so too.
 
-    The guard's limit for a frozen actual value is ``LOOSE_FROZEN_DEG`` at least.
+    The guard's limits for a frozen actual value and for unanswered torque are ``LOOSE_FROZEN_DEG`` and
+    ``LOOSE_UNANSWERED_PERMILLE`` at least.
 
     Raises ConfigError.
     """
@@ -50,6 +53,8 @@ def with_gain_set(config: GatewayConfig, gains: GainSet) -> GatewayConfig:
     # A loose axis stands in dry friction at its turning points while the demand goes on by more than a tight one would.
     frozen = config.guard.frozen_actual
     wide = frozen.model_copy(update={"limit_deg": max(frozen.limit_deg, LOOSE_FROZEN_DEG)})
-    guard = config.guard.model_copy(update={"frozen_actual": wide})
+    pushed = config.guard.unanswered_torque
+    strong = pushed.model_copy(update={"limit_permille": max(pushed.limit_permille, LOOSE_UNANSWERED_PERMILLE)})
+    guard = config.guard.model_copy(update={"frozen_actual": wide, "unanswered_torque": strong})
     changed = config.unaided.model_copy(update={"axes": axes, "guard": guard})
     return parse_config(yaml.safe_dump(changed.model_dump(mode="json"), sort_keys=False), config.path)

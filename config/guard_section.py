@@ -138,7 +138,8 @@ class GuardSection(Model):
     """The demand has gone so far while the actual value has not changed by a single count."""
     unanswered_torque: TorqueCondition = TorqueCondition(limit_permille=250, persistence_cycles=8, reaction=_DISABLE)
     """The torque actual value has changed so far, with the torque offset and without, while the actual value has not
-    changed by a single count: a blocked axis, or a dead resolver. Looked at where torque offsets are sent."""
+    changed by a single count: a blocked axis, or a dead resolver. Without torque offsets it must be more than what one
+    axis in motion puts on another that stands."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
     axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)
     """An axis' TPDO is missing while another axis' have come: it is that drive, not the bus or the host."""

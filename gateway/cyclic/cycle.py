@@ -405,6 +405,7 @@ class CyclicLoop:
             self._send_sync(now_ns)
 
     def _lose_syncs(self, count: int, now_ns: int) -> None:
+        self._watch.forget()
         if count >= self.sync_gap_limit and self.phase is not _COMMISSIONING:
             self.guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
 

@@ -176,6 +176,11 @@ class CycleWatch:
         for watched in self._watched:
             watched.settling = SETTLING_CYCLES
 
+    def forget(self) -> None:
+        """SYNCs have not been sent: what an axis has gone meanwhile is not a cycle's way."""
+        for watched in self._watched:
+            watched.is_fresh = False
+
     def note_silence(self, awaited: int) -> None:
         """One cycle of which only this counts: whose TPDO is missing (bits as for ``check``)."""
         for number, watched in enumerate(self._watched):

@@ -17,7 +17,6 @@ from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.torque_offsets import build_torque_offsets
 from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
 from gateway.learning.law import Learning, build_learning
-from gateway.record.sample import INT32_MAX
 from gateway.running.core import GatewayCore
 from gateway.running.drive_settings import axis_units, build_master, network_settings, node_settings, position_loop
 from gateway.running.machine_session import MachineSession
@@ -46,7 +45,7 @@ def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits]
             * config.cycle_s,
             torque_permille=guard.torque.limit_permille,
             frozen_counts=round(guard.frozen_actual.limit_deg / 360.0 * axis.counts_per_revolution),
-            unanswered_permille=guard.unanswered_torque.limit_permille if config.feed_forward.enabled else INT32_MAX,
+            unanswered_permille=guard.unanswered_torque.limit_permille,
         )
         for axis in config.ordered_axes
     ]

@@ -371,3 +371,13 @@ def test_a_resolver_that_dies_in_a_coupled_stop_takes_the_torque_from_the_follow
         check(watch, cycle, 3 * cycle, is_enabled=False, followers=followers)
     assert [trip.condition for trip in guard.tripped] == [Condition.FROZEN_ACTUAL] * tripped
     assert guard.disabled == 0b10 * tripped
+
+
+def test_a_way_gone_while_no_sync_was_sent_is_no_leap():
+    guard, axes, watch = make()
+    for cycle in range(40):
+        axes[1].actual = 4 * cycle + (200 if cycle >= 20 else 0)
+        if cycle == 20:
+            watch.forget()
+        check(watch, cycle, 4 * cycle)
+    assert not guard.tripped
