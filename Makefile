@@ -25,7 +25,7 @@ vcan: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m vcan
 
 slow: $(VENV)/installed-dev
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow -n 2 --dist loadfile
 
 bench: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -m bench -s

@@ -26,7 +26,7 @@ def unhurried(tmp_path_factory: pytest.TempPathFactory) -> Path:
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 1000}
     config["guard"] |= {name: {"reaction": "warn"} for name in LATENESS}
     # A drive that the only processor is kept from for a second has not left the bus.
-    config["guard"]["bus_off"]["persistence_cycles"] = 250
+    config["guard"]["bus_off"]["persistence_cycles"] = 249
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
     # A cycle that is lost on the way is 16 counts of travel here.
     config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
