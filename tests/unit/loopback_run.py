@@ -7,29 +7,21 @@ import time
 from pathlib import Path
 
 import yaml
+from slow_host import slow_host_paper
 
 from gateway.record.ring import RingReader, find_rings
 from gateway.record.sample import Phase
 
 ROOT = Path(__file__).resolve().parents[2]
 PATIENCE_S = 120.0
-LATENESS = ("missed_tpdo", "missed_deadline", "axis_silent")
-"""Conditions of the guard that a busy computer brings about."""
 
 
 def unhurried_machine(folder: Path) -> tuple[str, Path]:
     """``paper`` at 4 ms, its guards warning of what a busy computer is late with, under a name of its own."""
-    config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
+    config = slow_host_paper()
     config["name"] = f"{folder.name}-{os.getpid()}"
-    config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
-    config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    for axis in config["axes"].values():
-        del axis["sync_watchdog"]
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 2000}
-    config["guard"] |= {name: {"reaction": "warn"} for name in LATENESS}
     config["guard"]["sync_lost"] = {"limit_cycles": 100, "reaction": "warn"}
-    # A cycle that is lost on the way is 16 counts of travel here.
-    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     path = folder / "machine.yaml"
     path.write_text(yaml.safe_dump(config))
     return config["name"], path

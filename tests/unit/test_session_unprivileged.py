@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
+from slow_host import slow_host_paper
 
 from gateway.record.recording import read_recording
 
@@ -23,16 +24,10 @@ PATIENCE_S = 200.0
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     """``paper`` at 4 ms, its guards warning of what a busy computer is late with."""
-    config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
+    config = slow_host_paper()
     config["name"] = f"unprivileged-{os.getpid()}"
-    config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
-    config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    for axis in config["axes"].values():
-        del axis["sync_watchdog"]
     config["bus"] |= {"cycle_us": 4000, "heartbeat_timeout_ms": 2000}
-    config["guard"] |= {name: {"reaction": "warn"} for name in ("missed_tpdo", "missed_deadline", "axis_silent")}
     config["guard"]["sync_lost"] = {"limit_cycles": 100, "reaction": "warn"}
-    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     path = tmp_path / "unprivileged.yaml"
     path.write_text(yaml.safe_dump(config))
     return path

@@ -22,6 +22,7 @@ import canopen
 import pytest
 import yaml
 from peer_loops import bare_cycle, canopen_cycle, mapped_nodes, paced_us, waiting_for
+from slow_host import LATENESS, slow_host_paper
 
 from drivers.broadcast_manager import PeriodicFrame
 from drivers.frame import Frame
@@ -79,17 +80,9 @@ int main(int count, char **words) {
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``paper`` at the bench's cycle, its guards warning only."""
-    config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
-    config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
-    config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    for axis in config["axes"].values():
-        del axis["sync_watchdog"]
+    config = slow_host_paper((*LATENESS, "following_error"))
     config["bus"] |= {"cycle_us": CYCLE_US, "heartbeat_timeout_ms": 1000, "is_virtual": True}
-    warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error")
-    config["guard"] |= {name: {"reaction": "warn"} for name in warned}
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
-    # A cycle that is lost on the way is 16 counts of travel here.
-    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     config["guard"]["unanswered_torque"] = {"limit_permille": 30000, "reaction": "disable"}
     path = tmp_path_factory.mktemp("bench") / "bench.yaml"
     path.write_text(yaml.safe_dump(config))

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import yaml
+from slow_host import slow_host_paper
 
 from drivers.ports import interface_is_up
 
@@ -38,17 +39,11 @@ pytestmark = [
 @pytest.fixture
 def machine(tmp_path: Path) -> Path:
     """``paper`` at the bench's cycle, its guards warning only."""
-    config = yaml.safe_load((ROOT / "config" / "paper.yaml").read_text())
-    config["motion"]["curve"] = str(ROOT / "config" / config["motion"]["curve"])
-    config["emulator"]["eds"] = str(ROOT / "config" / config["emulator"]["eds"])
-    for axis in config["axes"].values():
-        del axis["sync_watchdog"]
+    config = slow_host_paper(())
     config["bus"] |= {"cycle_us": CYCLE_US, "heartbeat_timeout_ms": 2000, "is_virtual": True}
     warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error", "bus_off", "end_effector_error")
     config["guard"] |= {name: {**config["guard"].get(name, {}), "reaction": "warn"} for name in warned}
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
-    # A cycle that is lost on the way is 16 counts of travel here.
-    config["guard"]["frozen_actual"] = {"limit_deg": 10.0, "reaction": "disable"}
     config["guard"]["unanswered_torque"] = {"limit_permille": 30000, "reaction": "disable"}
     path = tmp_path / "deadlines.yaml"
     path.write_text(yaml.safe_dump(config))
