@@ -159,8 +159,12 @@ def home_angles(config: GatewayConfig) -> tuple[float, float]:
     return math.radians(master.home_angle_deg), math.radians(slave.home_angle_deg)
 
 
-def closure_at_home(config: GatewayConfig, curve: DesiredCurve) -> Closure:
-    """How the linkage is assembled: the side on which the desired curve has the end effector at the home position."""
+def closure_at_home(config: GatewayConfig) -> Closure:
+    """How the linkage is assembled: the side on which the desired curve has the end effector at the home position.
+
+    Raises mechanism.errors.CurveError.
+    """
+    curve = desired_curve(config)
     theta2, theta5 = home_angles(config)
     nearest = min(
         range(len(curve.theta2)), key=lambda i: abs(math.remainder(float(curve.theta2[i]) - theta2, math.tau))

@@ -10,11 +10,12 @@ import socket
 import struct
 from typing import Any, Final
 
+from drivers.hardware_stamps import SO_TIMESTAMPING
+
 DATAGRAM_BYTES: Final = 16
 _CONTROL_BYTES: Final = 128
 _SO_TIMESTAMPNS: Final = 35
 _SO_RXQ_OVFL: Final = 40
-_SO_TIMESTAMPING: Final = 37
 
 
 class _Vector(ctypes.Structure):
@@ -121,7 +122,7 @@ class MessageBatch:
             if kind == _SO_TIMESTAMPNS:
                 seconds, nanoseconds = _TIMESPEC.unpack_from(self._ancillary, offset + _ANCILLARY.size)
                 stamp_ns = seconds * 1_000_000_000 + nanoseconds
-            elif kind == _SO_TIMESTAMPING:
+            elif kind == SO_TIMESTAMPING:
                 stamps = _TIMESTAMPING.unpack_from(self._ancillary, offset + _ANCILLARY.size)
                 seconds, nanoseconds, _, _, hardware_s, hardware_ns = stamps
                 stamp_ns = seconds * 1_000_000_000 + nanoseconds

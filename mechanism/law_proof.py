@@ -30,15 +30,6 @@ GRID_MARGIN: Final = 1.005
 BISECTIONS: Final = 12
 
 
-def smooth(u: float) -> tuple[float, float]:
-    """10 u^3 - 15 u^4 + 6 u^5 and its derivative, for u held within 0 to 1."""
-    if u <= 0.0:
-        return 0.0, 0.0
-    if u >= 1.0:
-        return 1.0, 0.0
-    return u * u * u * (10.0 - u * (15.0 - 6.0 * u)), 30.0 * u * u * (1.0 - u) ** 2
-
-
 @dataclass(frozen=True, slots=True)
 class LawState:
     """theta5(theta2) = (1 - w) cam(theta2 + shift) + w park, rad; w goes from ``weight`` to ``weight_to`` as theta2

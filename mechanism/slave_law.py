@@ -24,9 +24,9 @@ from mechanism.law_proof import (
     Strained,
     Work,
     finish,
-    smooth,
 )
 from mechanism.motion import MasterPlan, plan_stop
+from mechanism.smooth import bend_of_smooth, peaks_of_smooth, shortest_smooth_s, smooth
 
 FADE_RAD: Final = 0.1
 """Shift at which a feed-forward that knows the cam alone has faded out."""
@@ -143,7 +143,8 @@ class SlaveLaw:
             return
         away, duration_s = abs(self._shift_to - self._shift_from), self._shift_s
         now = self._shift_at(duration_s - self._shift_left_s)
-        self._halt = plan_stop(*now, 5.774 * away / duration_s**2, 60.0 * away / duration_s**3)
+        _, acceleration, jerk = peaks_of_smooth(away, duration_s)
+        self._halt = plan_stop(*now, acceleration, jerk)
         self._shift_s = self._shift_left_s = self._halt.duration_s
 
     def _shift_at(self, t_s: float) -> tuple[float, float, float]:
@@ -152,7 +153,7 @@ class SlaveLaw:
             return self._halt.at(t_s)
         u, change, duration_s = t_s / self._shift_s, self._shift_to - self._shift_from, self._shift_s
         share, rate = smooth(u)
-        bend = 60.0 * u * (1.0 - u) * (1.0 - 2.0 * u)
+        bend = bend_of_smooth(u)
         return self._shift_from + share * change, rate * change / duration_s, bend * change / duration_s**2
 
     def prove_speed(self, speed: float) -> Work[None]:
@@ -184,19 +185,13 @@ class SlaveLaw:
         away = abs(shift - self.shift)
         if away == 0.0:
             return
-        # Of 10 u^3 - 15 u^4 + 6 u^5 the greatest first, second and third derivatives are 1.875, 5.774 and 60.
-        shortest_s = max(
-            1.875 * away / pace.shift_speed,
-            (5.774 * away / pace.shift_acceleration) ** 0.5,
-            (60.0 * away / pace.shift_jerk) ** (1.0 / 3.0),
-        )
+        shortest_s = shortest_smooth_s(away, pace.shift_speed, pace.shift_acceleration, pace.shift_jerk)
         path = [Piece(LawState(self.shift + n / (SHIFTS - 1) * (shift - self.shift))) for n in range(SHIFTS)]
         excess: Excess | None = None
         duration_s = shortest_s
         for slower in SLOWER:
             duration_s = slower * shortest_s
-            gains = 1.875 * away / duration_s, 5.774 * away / duration_s**2, 60.0 * away / duration_s**3
-            excess = yield from proof.excess(path, Pace(speed, *gains))
+            excess = yield from proof.excess(path, Pace(speed, *peaks_of_smooth(away, duration_s)))
             if excess is None or excess.what is Strained.SINE:
                 break
         if excess is not None:

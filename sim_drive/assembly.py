@@ -7,7 +7,7 @@ from math import inf, radians
 from pathlib import Path
 from typing import Final
 
-from config.conversion import closure_at_home, desired_curve, dynamics_parameters, home_angles
+from config.conversion import closure_at_home, dynamics_parameters, home_angles
 from config.emulation_section import FrictionLaw
 from config.loading import SHIPPED
 from config.quirks import Quirk
@@ -60,7 +60,7 @@ def build_machine(
     drives = [_make_drive(node_id, own, describe) for node_id, own in zip(node_ids, settings, strict=False)]
     parameters = PlantParameters(
         dynamics=dynamics_parameters(config),
-        closure=closure_at_home(config, desired_curve(config)),
+        closure=closure_at_home(config),
         axes=(_driveline(axes[0]), _driveline(axes[1])),
         singular_sine=SINGULAR_SHARE * config.machine.minimum_transmission_sine,
         substeps=config.emulator.sub_steps,

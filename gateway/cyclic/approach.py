@@ -7,6 +7,7 @@ from gateway.record.sample import Phase
 from gateway.units import AxisUnits, wrap_counts
 from mechanism.approach import ApproachField, Point
 from mechanism.motion import MasterPlan, plan_stop
+from mechanism.smooth import bend_of_smooth, shortest_smooth_s, smooth
 
 MASTER = 0
 
@@ -59,13 +60,7 @@ class ApproachDemand:
         self._step = 0
         self._share = (0.0, 0.0, 0.0)
         limits = self._limits
-        length = self._length()
-        # Of s = 10 u^3 - 15 u^4 + 6 u^5 the greatest first, second and third derivatives are 1.875, 5.774 and 60.
-        duration_s = max(
-            1.875 * length / limits.speed,
-            (5.774 * length / limits.acceleration) ** 0.5,
-            (60.0 * length / limits.jerk) ** (1.0 / 3.0),
-        )
+        duration_s = shortest_smooth_s(self._length(), limits.speed, limits.acceleration, limits.jerk)
         self._steps = max(int(duration_s / self._period_s) + 1, 1)
 
     def _length(self) -> float:
@@ -104,11 +99,8 @@ class ApproachDemand:
             return self._stop.at(self._step * self._period_s)
         duration_s = self._steps * self._period_s
         u = min(self._step / self._steps, 1.0)
-        return (
-            u * u * u * (10.0 - u * (15.0 - 6.0 * u)),
-            30.0 * u * u * (1.0 - u) ** 2 / duration_s,
-            60.0 * u * (1.0 - u) * (1.0 - 2.0 * u) / duration_s**2,
-        )
+        share, rate = smooth(u)
+        return share, rate / duration_s, bend_of_smooth(u) / duration_s**2
 
     def _go_on(self) -> None:
         if self._stop is not None:

@@ -128,10 +128,6 @@ class Guard:
         """Every trip, the first of each condition and axis; the caller takes them away."""
         self._told: set[tuple[Condition, int]] = set()
 
-    def persistence(self, condition: Condition) -> int:
-        """Cycles in a row that a condition must hold."""
-        return self._persistence[condition]
-
     def emergency_condition(self, code: int) -> Condition:
         """Which condition an EMCY with this error code is."""
         return Condition.EMERGENCY_WARNING if code in self._warning_codes else Condition.EMERGENCY

@@ -12,7 +12,6 @@ import numpy as np
 
 from config.conversion import (
     closure_at_home,
-    desired_curve,
     drive_damping,
     nominal_parameters,
     torque_delay_s,
@@ -126,7 +125,7 @@ def build_feed_forward(config: GatewayConfig, profile: CamProfile) -> FeedForwar
     master, slave = config.axis_names
     return FeedForward(
         nominal_parameters(config),
-        closure_at_home(config, desired_curve(config)),
+        closure_at_home(config),
         profile,
         config.feed_forward.coulomb_velocity_rad_per_s,
         (drive_damping(config, master), drive_damping(config, slave)),

@@ -158,6 +158,10 @@ class CycleWatch:
                 self._check_follower(number, watched, targets[number], now_ns)
             else:
                 watched.is_fresh = False
+                continue
+            watched.actual = watched.axis.actual
+            watched.target = targets[number]
+            watched.is_fresh = True
         cam = self._cam
         if cam is not None and is_enabled and not awaited and _RAMP_UP <= phase <= _CONTROLLED_STOP:
             master, slave = self._watched
@@ -222,18 +226,11 @@ class CycleWatch:
                 self._check_push(number, watched, torque_offset, now_ns)
         else:
             watched.travelled = watched.still_cycles = 0
-        watched.actual = actual
-        watched.target = target
-        watched.is_fresh = True
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
         """A resolver that dies in a stop is as bad as in a run."""
-        actual = watched.axis.actual
-        moved = (actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        moved = (watched.axis.actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
         self._check_answer(number, watched, target, moved, now_ns)
-        watched.actual = actual
-        watched.target = target
-        watched.is_fresh = True
 
     def _check_drive(self, number: int, watched: _WatchedAxis, now_ns: int) -> None:
         guard, axis = self._guard, watched.axis
@@ -255,17 +252,14 @@ class CycleWatch:
     def _check_velocity(self, number: int, watched: _WatchedAxis, moved: int, now_ns: int) -> None:
         """A single leap counts for as long as it is more than the axis could have gone since: a glitch goes back."""
         if not watched.is_fresh:
-            watched.leap_cycles = 0
+            watched.leap = watched.leap_cycles = 0
             return
         guard, bound = self._guard, watched.velocity
-        if watched.leap_cycles:
-            watched.leap += moved
-        else:
-            watched.leap = moved
+        watched.leap += moved
         watched.leap_cycles += 1
         reach = bound * watched.leap_cycles
         if -bound <= moved <= bound and -reach <= watched.leap <= reach:
-            watched.leap_cycles = 0
+            watched.leap = watched.leap_cycles = 0
             if not guard.is_quiet:
                 guard.clear(Condition.VELOCITY, number)
             return

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from config.conversion import closure_at_home, controller_gains, desired_curve, nominal_parameters
+from config.conversion import closure_at_home, controller_gains, nominal_parameters
 from config.schema import GatewayConfig
 from config.torque_sections import LearnedAxisSection
 from gateway.learning import kernels as kernels
@@ -173,7 +173,7 @@ def _axis_law(config: GatewayConfig, name: str) -> tuple[float, float, float, fl
 def masses_along(config: GatewayConfig, profile: CamProfile, bins: int) -> Float:
     """The nominal model's mass matrix in the middle of every bin: (3, bins), rows m11, m12, m22, kg m^2."""
     parameters = nominal_parameters(config).to_array()
-    closure = int(closure_at_home(config, desired_curve(config)))
+    closure = int(closure_at_home(config))
     masses = np.empty((kernels.MASSES, bins))
     for b in range(bins):
         theta2 = (b + 0.5) * tau / bins

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from config.conversion import closure_at_home, desired_curve, five_bar
+from config.conversion import closure_at_home, five_bar
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
 from gateway.cyclic.axis_channel import AxisChannel
@@ -50,7 +50,7 @@ def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits]
         for axis in config.ordered_axes
     ]
     master, slave = config.ordered_axes
-    geometry, closure = five_bar(config).to_array(), int(closure_at_home(config, desired_curve(config)))
+    geometry, closure = five_bar(config).to_array(), int(closure_at_home(config))
     window_rad, end_effector_m = math.radians(guard.cam_window.limit_deg), guard.end_effector_error.limit_mm / 1e3
     cam = law.cam
     harmless = harmless_error(geometry, closure, cam.coefficients, cam.net_turns, window_rad, end_effector_m)
@@ -157,7 +157,7 @@ def build_approach(config: GatewayConfig, profile: CamProfile, machine_cycles: i
     return Approach(
         ApproachField(
             five_bar(config),
-            closure_at_home(config, desired_curve(config)),
+            closure_at_home(config),
             profile,
             config.machine.minimum_transmission_sine,
             None if position is None else (math.radians(position[0]), math.radians(position[1])),

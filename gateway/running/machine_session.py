@@ -15,7 +15,7 @@ from drivers.errors import DriveError, NodeError
 from drivers.master import Master, Procedure
 from drivers.nmt import NmtCommand
 from drivers.node import Event
-from gateway.cyclic.approach import Approach
+from gateway.cyclic.approach import Approach, ApproachDemand
 from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.guard import Guard, StopReason
@@ -264,10 +264,7 @@ class MachineSession:
             demand.begin(self.plan, [axis.channel.target for axis in self.axes])
             loop.follow(demand, demand.observer)
             self.is_following = True
-            while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
-                if self.is_stop_requested:
-                    loop.controlled_stop()
-                yield self.master.now_ns + NS_PER_S
+            yield from self._until_finished(demand)
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self.is_stop_requested else StopReason.COMPLETED)
         if loop.phase is not Phase.QUICK_STOP:
             yield from self.master.pause(SETTLE_S)
@@ -279,6 +276,14 @@ class MachineSession:
             self._step("the slave ends off its cam: give the next run --from-here")
         if loop.phase is Phase.QUICK_STOP:
             self._step("quick stop")
+
+    def _until_finished(self, demand: CamDemand | ApproachDemand) -> Procedure[None]:
+        """Let the cycle follow its demand until that, or a stop that leaves it, is over."""
+        loop = self.loop
+        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
+            if self.is_stop_requested:
+                loop.controlled_stop()
+            yield self.master.now_ns + NS_PER_S
 
     def may_move(self) -> bool:
         """Whether nothing has called for a stop."""
@@ -294,13 +299,10 @@ class MachineSession:
 
     def _go_onto_cam(self, approach: Approach) -> Procedure[None]:
         self._step("approaching the cam")
-        loop, demand = self.loop, approach.demand
+        demand = approach.demand
         demand.begin(self._way, [axis.channel.target for axis in self.axes])
-        loop.follow(demand)
-        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
-            if self.is_stop_requested:
-                loop.controlled_stop()
-            yield self.master.now_ns + NS_PER_S
+        self.loop.follow(demand)
+        yield from self._until_finished(demand)
         if self.may_move():
             yield from self.master.pause(SETTLE_S)
             self.plan = approach.plan_from(self._way[-1][0])

@@ -3,7 +3,7 @@
 import math
 from typing import Final
 
-from config.conversion import closure_at_home, desired_curve, nominal_parameters, torque_offset_limit
+from config.conversion import closure_at_home, nominal_parameters, torque_offset_limit
 from config.schema import GatewayConfig
 from gateway.cyclic.operation import OperationLimits
 from mechanism.cam_profile import CamProfile
@@ -34,7 +34,7 @@ def law_limits(config: GatewayConfig) -> LawLimits:
     return LawLimits(
         axis_names=(names[0], names[1]),
         dynamics=nominal_parameters(config).to_array(),
-        closure=int(closure_at_home(config, desired_curve(config))),
+        closure=int(closure_at_home(config)),
         coulomb_velocity=config.feed_forward.coulomb_velocity_rad_per_s,
         minimum_sine=config.machine.minimum_transmission_sine,
         master_velocity=master.velocity_rad_per_s,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from config.conversion import closure_at_home, desired_curve, dynamics_parameters
+from config.conversion import closure_at_home, dynamics_parameters
 from config.loading import load_config
 from mechanism.jit import kernel
 from sim_drive.physics.compliant import CompliantPlant, advance_compliant
@@ -53,9 +53,7 @@ def many_compliant(state, dynamics, settings, couplings, scratch, closure, singu
 def parameters(**driveline) -> PlantParameters:
     config = load_config("paper")
     axis = AxisDriveline(**driveline)
-    return PlantParameters(
-        dynamics_parameters(config), closure_at_home(config, desired_curve(config)), (axis, axis), singular_sine=1e-9
-    )
+    return PlantParameters(dynamics_parameters(config), closure_at_home(config), (axis, axis), singular_sine=1e-9)
 
 
 def best_us(work: Callable[[], None]) -> float:

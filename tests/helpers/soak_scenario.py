@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from config.conversion import closure_at_home, desired_curve, five_bar
+from config.conversion import closure_at_home, five_bar
 from config.loading import load_config
 from drivers import objects
 from gateway.cyclic.guard import Condition
@@ -203,10 +203,10 @@ def _make_otherwise(document: dict[str, Any], source: Random) -> None:
 
 def _smaller_curve(share: float) -> Path:
     """The curve that the end effector traces if the servo makes the paper's motion times ``share``."""
-    cam, curve = compile_config(PAPER), desired_curve(PAPER)
+    cam = compile_config(PAPER)
     theta2 = np.radians(np.arange(360.0))
     theta5 = share * cam.profile.at_many(theta2)[:, 0]
-    points = five_bar(PAPER).end_effector(theta2, theta5, closure_at_home(PAPER, curve)) * 1e3
+    points = five_bar(PAPER).end_effector(theta2, theta5, closure_at_home(PAPER)) * 1e3
     path = Path(tempfile.gettempdir()) / f"drive-gateway-soak-{share:g}.csv"
     lines = [f"{degrees},{x:.6f},{y:.6f}" for degrees, (x, y) in enumerate(points)]
     # Another process may be reading it.

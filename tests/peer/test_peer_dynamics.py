@@ -13,7 +13,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from config.conversion import closure_at_home, desired_curve, dynamics_parameters
+from config.conversion import closure_at_home, dynamics_parameters
 from config.loading import load_config
 from config.schema import GatewayConfig
 from gateway.running.preparation import compile_config
@@ -227,4 +227,4 @@ def test_forward_and_inverse_dynamics_and_energy_in_random_states(
 
 
 def test_home_of_the_paper_is_the_same_closure(paper: GatewayConfig) -> None:
-    assert closure_at_home(paper, desired_curve(paper)) is compile_config(paper).closure
+    assert closure_at_home(paper) is compile_config(paper).closure

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from config.conversion import closure_at_home, desired_curve, five_bar
+from config.conversion import closure_at_home, five_bar
 from config.loading import load_config, parse_config
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.operation import Operation, Order
@@ -90,7 +90,7 @@ class Operated:
             found.append(worst[1] / of_slave)
             assert worst[0] <= of_master * (1 + ROUNDING) + ROUNDING, n
             assert worst[1] <= of_slave * (1 + ROUNDING) + ROUNDING, n
-        closure = closure_at_home(self.config, desired_curve(self.config))
+        closure = closure_at_home(self.config)
         sines = np.abs(five_bar(self.config).transmission_sines(angles[:, 0], angles[:, 1], closure)[:, 0])
         assert sines.min() >= self.config.machine.minimum_transmission_sine * (1 - 1e-3)
         return found

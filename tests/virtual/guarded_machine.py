@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from config.conversion import closure_at_home, desired_curve, dynamics_parameters
+from config.conversion import closure_at_home, dynamics_parameters
 from config.loading import load_config, parse_config
 from config.schema import GatewayConfig
 from drivers.frame import Frame
@@ -294,7 +294,7 @@ def shaft_torques(angles: np.ndarray, tick_s: float, config: GatewayConfig) -> t
     omega = np.gradient(angles, tick_s, axis=0)
     alpha = np.gradient(omega, tick_s, axis=0)
     torques = np.empty_like(angles)
-    closure = closure_at_home(config, desired_curve(config))
+    closure = closure_at_home(config)
     params = dynamics_parameters(config).to_array()
     inverse_dynamics_along(params, angles, omega, alpha, int(closure), 0.0, torques)
     peaks = np.abs(torques).max(axis=0)
