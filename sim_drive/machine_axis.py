@@ -71,9 +71,9 @@ class Motor:
         "_noise",
         "_noise_source",
         "_permille_per_Nm",
+        "_steps",
         "_tap",
         "_ticked_at_ns",
-        "_velocity",
         "axis",
         "counts",
         "delayed_torque",
@@ -96,8 +96,8 @@ class Motor:
         self._permille_per_Nm = 1000.0 / axis.rated_torque_Nm
         self._noise = 0.0
         self._eccentricity = axis.resolver_eccentricity_counts
-        self._velocity = 0.0
-        """Counts/s, over the last servo period."""
+        self._steps = (0, 0, 0)
+        """Counts gone in each of the last servo periods."""
         self._is_powered = False
         self._has_tripped = False
         self.delayed_torque = 0.0
@@ -135,7 +135,8 @@ class Motor:
         tap = self._tap
         plain = angle * self._counts_per_rad + self._noise + 0.5
         counts = floor(plain) if self._is_plain else self.quantise(angle)
-        self._velocity = float((counts - self.counts) * SERVO_RATE_HZ)
+        _, before, last = self._steps
+        self._steps = (before, last, counts - self.counts)
         self.counts = counts
         drive_axis.on_tick(now_ns, counts)
         self.is_braked = not drive_axis.is_brake_released and (tap is None or not tap.is_brake_broken)
@@ -165,6 +166,11 @@ class Motor:
             torque, self.delayed_torque = self.delayed_torque, torque
         return torque
 
+    def _median_step(self) -> int:
+        """Of the last three servo periods: a single leap of the resolver is not taken for a velocity."""
+        first, second, third = self._steps
+        return max(min(first, second), min(max(first, second), third))
+
     def _power_on(self, demand_counts: float, now_ns: int) -> None:
         """The drive has switched its amplifier on since the tick before."""
         self._is_powered = True
@@ -192,7 +198,7 @@ class Motor:
             radians = angle(index, offset_s)
             return (
                 floor(radians * self._counts_per_rad + self._noise + 0.5) if self._is_plain else self.quantise(radians),
-                self._velocity,
+                float(self._median_step() * SERVO_RATE_HZ),
                 floor(torque(index) * self._permille_per_Nm + 0.5),
             )
 
