@@ -13,6 +13,8 @@ _MAX_INTEGER16 = 32767
 _LONGEST_PERSISTENCE_S = 10.0
 """Whatever has held for so long without a reaction is never going to be stopped in time."""
 _MAX_VELOCITY_PERCENT = 1000.0
+FRICTION_SLACK = 2.2
+"""An axis that stands is held against twice its dry friction: from all of it one way to all of it the other way."""
 
 Persistence = Annotated[int, Field(ge=1, le=100_000)]
 ErrorCode = Annotated[int, Field(ge=1, le=0xFFFF)]
@@ -78,6 +80,14 @@ class TorqueCondition(ConditionSection):
         return self
 
 
+class PushCondition(TorqueCondition):
+    """A torque that nothing comes of."""
+
+    def lasting_permille(self, friction_permille: int) -> int:
+        """What is as bad if it lasts: half the limit, but more than dry friction, either way, holds an axis against."""
+        return min(max(self.limit_permille // 2, round(FRICTION_SLACK * friction_permille)), self.limit_permille)
+
+
 class LengthCondition(ConditionSection):
     """A condition whose limit is a distance of the end effector."""
 
@@ -135,11 +145,11 @@ class GuardSection(Model):
     end_effector_error: LengthCondition = LengthCondition(limit_mm=50.0, persistence_cycles=5, reaction=_QUICK)
     """Distance of the end effector from where the demand has it."""
     frozen_actual: AngleCondition = AngleCondition(limit_deg=1.0, persistence_cycles=3, reaction=_DISABLE)
-    """The demand has gone so far while the actual value has not changed by a single count."""
-    unanswered_torque: TorqueCondition = TorqueCondition(limit_permille=250, persistence_cycles=8, reaction=_DISABLE)
-    """The torque actual value has changed so far, with the torque offset and without, while the actual value has not
-    changed by a single count: a blocked axis, or a dead resolver. Without torque offsets it must be more than what one
-    axis in motion puts on another that stands."""
+    """The demand has gone so far away from the actual value while that has not changed by a single count."""
+    unanswered_torque: PushCondition = PushCondition(limit_permille=250, persistence_cycles=8, reaction=_DISABLE)
+    """The torque actual value has changed so far, or for 80 cycles half as far, with the torque offset and without,
+    while the actual value has not changed by a single count: a blocked axis, or a dead resolver. Without torque offsets
+    it must be more than what one axis in motion puts on another that stands."""
     missed_tpdo: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_CONTROLLED)
     axis_silent: ConditionSection = ConditionSection(persistence_cycles=5, reaction=_QUICK)
     """An axis' TPDO is missing while another axis' have come: it is that drive, not the bus or the host."""

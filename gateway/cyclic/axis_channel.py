@@ -1,9 +1,15 @@
 """One axis as the cycle sees it."""
 
+import math
+from typing import Final
+
 from drivers.cia402 import COMMAND_DISABLE_VOLTAGE
 from drivers.pdo import RPDO_BASE, TPDO_BASE
 from gateway.cyclic.position_loop import PositionLoop
 from gateway.units import AxisUnits
+
+LEAP_GAP_CYCLES: Final = 2
+"""A leap is told over so many missed TPDOs; an axis that was told nothing for longer may have gone as far."""
 
 
 class AxisChannel:
@@ -13,6 +19,8 @@ class AxisChannel:
         "actual",
         "controlword",
         "following_error_limit",
+        "leap_limit",
+        "leapt",
         "name",
         "node_id",
         "position_loop",
@@ -50,3 +58,18 @@ class AxisChannel:
         self.torque = 0
         self.silent_cycles = 0
         """Cycles in a row that have been without its TPDO."""
+        self.leap_limit = math.inf
+        """Counts in a cycle, beyond those expected, that no axis goes: its resolver has leapt."""
+        self.leapt = 0
+        """Counts that the actual value shows too much, as far as its resolver has been seen to leap."""
+
+    def sees_leap(self, moved: int, expected: float) -> bool:
+        """Whether the resolver has leapt, and not the axis moved, where the actual value has changed by ``moved``.
+
+        ``expected``: counts that the axis has gone in that time, as far as anybody can know. What is farther from that
+        than ``leap_limit`` is a leap, and is kept in ``leapt``; what is nearer is taken for motion.
+        """
+        if abs(moved - expected) <= self.leap_limit:
+            return False
+        self.leapt += round(moved - expected)
+        return True

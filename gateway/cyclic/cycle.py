@@ -243,6 +243,11 @@ class CyclicLoop:
         for axis in self.axes:
             axis.controlword = controlword
 
+    def begin_guarding(self) -> None:
+        """All drives are in Operation enabled, and are meant to stay in it."""
+        self.is_guarding_enabled = True
+        self._watch.begin()
+
     def controlled_stop(self) -> None:
         """Ramp the master down on the cam, if anything is in motion."""
         if self._demand is not None:
@@ -405,7 +410,6 @@ class CyclicLoop:
             self._send_sync(now_ns)
 
     def _lose_syncs(self, count: int, now_ns: int) -> None:
-        self._watch.forget()
         if count >= self.sync_gap_limit and self.phase is not _COMMISSIONING:
             self.guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
 
@@ -435,7 +439,11 @@ class CyclicLoop:
         """SYNC of the next cycle is on the bus."""
         self._sync_due_ns += self.period_ns
         self._sync_deviation_ns = deviation_ns
-        self.sync_period_ns = sync_ns - self._sync_ns
+        self.sync_period_ns = span_ns = sync_ns - self._sync_ns
+        if span_ns > self.period_ns + self.period_ns // SYNC_PATIENCE:
+            self._watch.forget()
+            if self._coupled_stop is not None:
+                self._coupled_stop.skip(span_ns // self.period_ns)
         self._sync_ns = sync_ns
         self._arrival_ns = sync_ns
         self._sent_ns = 0

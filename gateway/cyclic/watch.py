@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, AxisChannel
 from gateway.cyclic.guard import Condition, Guard
 from gateway.record.sample import INT32_MAX, Phase
 from gateway.units import HALF_RANGE, RANGE_MASK
@@ -18,7 +18,13 @@ STATUSWORD_STATE_MASK: Final = 0x6F
 STATUSWORD_OPERATION_ENABLED: Final = 0x27
 SETTLING_CYCLES: Final = 10
 """Cycles for which an axis may stand where its direction turns, or its friction holds it, before it is in motion."""
+PUSHED_CYCLES: Final = 80
+"""An integrator pushes slowly, and an axis that nobody sees is the faster for it: for so long less is as bad."""
 MICROMETRES: Final = 1e6
+LEAP_SHARE: Final = 2.0
+"""Of the velocity limit: an axis that is so much faster within a single cycle has not moved, its resolver has leapt."""
+LEAST_LEAP_COUNTS: Final = 20.0
+"""What a coarse resolver's noise shows is no leap."""
 
 _RAMP_UP: Final = Phase.RAMP_UP
 _CONTROLLED_STOP: Final = Phase.CONTROLLED_STOP
@@ -34,9 +40,11 @@ class AxisLimits:
     """Travel of the demand while the actual value stays the same."""
     unanswered_permille: int
     """Change of torque while the actual value stays the same."""
+    pushed_permille: int
+    """The same, if it lasts for ``PUSHED_CYCLES``."""
 
 
-NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX)
+NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX, INT32_MAX)
 STILL_CYCLES: Final = (8, 16, 24)
 """So long after its last count an axis' torque is looked at, and the middle one taken for what its standing takes: a
 count of the demand, or of the resolver's noise, is a blow to a controller, and may hit one of them."""
@@ -66,8 +74,9 @@ class _WatchedAxis:
         "error",
         "frozen_counts",
         "is_fresh",
-        "leap",
-        "leap_cycles",
+        "is_known",
+        "pushed",
+        "pushed_cycles",
         "settling",
         "still_cycles",
         "still_torques",
@@ -80,26 +89,29 @@ class _WatchedAxis:
 
     def __init__(self, axis: AxisChannel, limits: AxisLimits) -> None:
         self.axis = axis
+        axis.leap_limit = max(LEAP_SHARE * limits.velocity_counts_per_cycle, LEAST_LEAP_COUNTS)
         self.velocity = limits.velocity_counts_per_cycle
         self.torque = limits.torque_permille
         self.frozen_counts = limits.frozen_counts
         self.unanswered = limits.unanswered_permille
+        self.pushed = limits.pushed_permille
         self.settling = 0
         """Cycles without movement that say nothing of the resolver yet."""
         self.actual = 0
         self.target = 0
         self.error = 0
         self.travelled = 0
-        """Counts that the demand has gone since the actual value changed last."""
-        self.leap = 0
-        """Counts since the axis was too fast first, and cycles."""
-        self.leap_cycles = 0
+        """Counts that the demand has gone away from the actual value since that changed last."""
         self.still_cycles = 0
         """Cycles since the actual value changed last."""
         self.still_torques = [(0, 0)] * len(STILL_CYCLES)
         """Torque actual value and torque offset then."""
+        self.pushed_cycles = 0
+        """Cycles in a row with a torque that is too much if it lasts."""
         self.is_fresh = False
         """The actual value of the cycle before is known."""
+        self.is_known = False
+        """That of a cycle shortly before is, and every SYNC since then has been sent."""
 
 
 class CycleWatch:
@@ -157,11 +169,11 @@ class CycleWatch:
             elif followers >> number & 1:
                 self._check_follower(number, watched, targets[number], now_ns)
             else:
-                watched.is_fresh = False
+                watched.is_fresh = watched.is_known = False
                 continue
             watched.actual = watched.axis.actual
             watched.target = targets[number]
-            watched.is_fresh = True
+            watched.is_fresh = watched.is_known = True
         cam = self._cam
         if cam is not None and is_enabled and not awaited and _RAMP_UP <= phase <= _CONTROLLED_STOP:
             master, slave = self._watched
@@ -175,6 +187,11 @@ class CycleWatch:
                 return
             self._check_cam(cam, master.error, slave.error, master_position, now_ns)
 
+    def begin(self) -> None:
+        """All axes are held where they stand: whatever their resolvers show there is right."""
+        for watched in self._watched:
+            watched.axis.leapt = 0
+
     def let_settle(self) -> None:
         """All axes have been left without a demand, and have to be set in motion anew: until then they may stand."""
         for watched in self._watched:
@@ -183,7 +200,7 @@ class CycleWatch:
     def forget(self) -> None:
         """SYNCs have not been sent: what an axis has gone meanwhile is not a cycle's way."""
         for watched in self._watched:
-            watched.is_fresh = False
+            watched.is_fresh = watched.is_known = False
 
     def note_silence(self, awaited: int) -> None:
         """One cycle of which only this counts: whose TPDO is missing (bits as for ``check``)."""
@@ -197,6 +214,8 @@ class CycleWatch:
             if awaited >> number & 1:
                 watched.axis.silent_cycles += 1
                 watched.is_fresh = False
+                if watched.axis.silent_cycles > LEAP_GAP_CYCLES:
+                    watched.is_known = False
                 guard.hold_cycles(Condition.MISSED_TPDO, number, now_ns)
                 if not is_nobody_here:
                     guard.hold_cycles(Condition.AXIS_SILENT, number, now_ns)
@@ -221,7 +240,7 @@ class CycleWatch:
             and -velocity <= moved <= velocity
         ):
             self._check_drive(number, watched, now_ns)
-            self._check_velocity(number, watched, moved, now_ns)
+            self._check_velocity(number, watched, target, moved, now_ns)
             if self._check_answer(number, watched, target, moved, now_ns):
                 self._check_push(number, watched, torque_offset, now_ns)
         else:
@@ -229,7 +248,7 @@ class CycleWatch:
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
         """A resolver that dies in a stop is as bad as in a run."""
-        moved = (watched.axis.actual - watched.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        moved = _way(watched.actual, watched.axis.actual)
         self._check_answer(number, watched, target, moved, now_ns)
 
     def _check_drive(self, number: int, watched: _WatchedAxis, now_ns: int) -> None:
@@ -249,21 +268,22 @@ class CycleWatch:
         elif not guard.is_quiet:
             guard.clear(Condition.TORQUE, number)
 
-    def _check_velocity(self, number: int, watched: _WatchedAxis, moved: int, now_ns: int) -> None:
-        """A single leap counts for as long as it is more than the axis could have gone since: a glitch goes back."""
+    def _check_velocity(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> None:
+        """A leap of the resolver counts until it goes back."""
+        guard, bound, axis = self._guard, watched.velocity, watched.axis
+        if watched.is_known:
+            axis.sees_leap(moved, _way(watched.target, target))
         if not watched.is_fresh:
-            watched.leap = watched.leap_cycles = 0
             return
-        guard, bound = self._guard, watched.velocity
-        watched.leap += moved
-        watched.leap_cycles += 1
-        reach = bound * watched.leap_cycles
-        if -bound <= moved <= bound and -reach <= watched.leap <= reach:
-            watched.leap = watched.leap_cycles = 0
+        if not -bound <= moved <= bound:
+            guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
+        elif 2.0 * abs(axis.leapt) > axis.leap_limit:
+            guard.hold(Condition.VELOCITY, number, axis.leapt, int(bound), now_ns)
+        else:
+            # What is left of leaps that have gone back is how well the way meanwhile was known.
+            axis.leapt = 0
             if not guard.is_quiet:
                 guard.clear(Condition.VELOCITY, number)
-            return
-        guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
 
     def _check_answer(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> bool:
         """Whether an axis that is asked to move shows anything of it; returns whether it stands on one count."""
@@ -278,8 +298,10 @@ class CycleWatch:
         if watched.settling:
             watched.settling -= 1
             return False
-        travel = (target - watched.target + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-        watched.travelled += travel if travel > 0 else -travel
+        # A demand that comes back to an axis that stands, as after an overshoot, asks nothing of it.
+        away = abs(_way(watched.axis.actual, target)) - abs(_way(watched.axis.actual, watched.target))
+        if away > 0:
+            watched.travelled += away
         if watched.travelled > watched.frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
         return True
@@ -290,6 +312,7 @@ class CycleWatch:
         watched.still_cycles += 1
         still = watched.still_torques
         if watched.still_cycles <= STILL_CYCLES[-1]:
+            watched.pushed_cycles = 0
             if watched.still_cycles in STILL_CYCLES:
                 still[STILL_CYCLES.index(watched.still_cycles)] = torque, torque_offset
                 if watched.still_cycles == STILL_CYCLES[-1]:
@@ -300,8 +323,12 @@ class CycleWatch:
         # Neither a load that the offset foresees is a push, nor an offset that takes a load over from the controller.
         unforeseen = pushed - (torque_offset - still_offset)
         push = min(abs(pushed), abs(unforeseen))
-        if push > watched.unanswered and self._is_plain():
-            guard.hold(Condition.UNANSWERED_TORQUE, number, push, watched.unanswered, now_ns)
+        limit = watched.unanswered
+        watched.pushed_cycles = watched.pushed_cycles + 1 if push > watched.pushed else 0
+        if watched.pushed_cycles > PUSHED_CYCLES:
+            limit = watched.pushed
+        if push > limit and self._is_plain():
+            guard.hold(Condition.UNANSWERED_TORQUE, number, push, limit, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.UNANSWERED_TORQUE, number)
 
@@ -334,6 +361,11 @@ class CycleWatch:
             )
         elif not guard.is_quiet:
             guard.clear(Condition.END_EFFECTOR_ERROR, 0)
+
+
+def _way(before: int, after: int) -> int:
+    """Counts from one position to the next."""
+    return (after - before + HALF_RANGE & RANGE_MASK) - HALF_RANGE
 
 
 def _counts(value: float, unit: float) -> int:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from config.conversion import closure_at_home, five_bar
+from config.conversion import closure_at_home, five_bar, nominal_parameters
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
 from gateway.cyclic.axis_channel import AxisChannel
@@ -46,8 +46,9 @@ def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits]
             torque_permille=guard.torque.limit_permille,
             frozen_counts=round(guard.frozen_actual.limit_deg / 360.0 * axis.counts_per_revolution),
             unanswered_permille=guard.unanswered_torque.limit_permille,
+            pushed_permille=guard.unanswered_torque.lasting_permille(axis_units(axis).permille(friction)),
         )
-        for axis in config.ordered_axes
+        for axis, friction in zip(config.ordered_axes, nominal_parameters(config).coulomb_N_m, strict=True)
     ]
     master, slave = config.ordered_axes
     geometry, closure = five_bar(config).to_array(), int(closure_at_home(config))

@@ -224,7 +224,7 @@ class MachineSession:
         problems = problems or self._moved_apart(held, [axis.channel.actual for axis in self.axes])
         if problems:
             raise CommissioningError(problems)
-        self.loop.is_guarding_enabled = True
+        self.loop.begin_guarding()
         self.loop.phase = Phase.STANDSTILL
 
     def _away_from_start(self, positions: Sequence[int], what: str) -> list[str]:

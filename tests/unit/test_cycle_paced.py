@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from config.schema import GuardSection
 from drivers.nmt import SYNC_COB_ID
 from gateway.cyclic.cycle import AxisChannel, CyclicLoop
-from gateway.cyclic.guard import Guard
-from gateway.record.sample import Phase, SampleFlag
+from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.watch import AxisLimits, CycleWatch
+from gateway.record.sample import INT32_MAX, Phase, SampleFlag
 from gateway.units import AxisUnits
 
 MS = 1_000_000
@@ -51,13 +52,12 @@ class Counting:
 
 
 class Bench:
-    def __init__(self, is_paced=True):
+    def __init__(self, is_paced=True, limits=()):
         units = AxisUnits(4096, 0.0, 1.5)
         self.sink = ListSink()
         guard = Guard(GuardSection(), ("cv", "servo"))
-        self.loop = CyclicLoop(
-            [AxisChannel(n, i, units, 10**6) for i, n in ((1, "cv"), (2, "servo"))], MS, guard, self.sink
-        )
+        axes = [AxisChannel(n, i, units, 10**6) for i, n in ((1, "cv"), (2, "servo"))]
+        self.loop = CyclicLoop(axes, MS, guard, self.sink, watch=CycleWatch(guard, axes, limits))
         self.loop.is_paced = is_paced
         self.demand = Counting()
         self.loop.follow(self.demand)
@@ -181,6 +181,26 @@ def test_one_missing_sync_costs_no_step():
     assert bench.loop.missing_syncs == 0
     bench.cycle(3 * MS)
     assert [row["flags"] for row in bench.sink.rows] == [SampleFlag.SYNC_LOST, SampleFlag.SYNC_LOST]
+
+
+@pytest.mark.parametrize("gap_ns", [0, 5_300_000])
+def test_a_way_gone_while_a_sync_was_missing_is_no_leap(gap_ns):
+    """39 counts in a cycle of 5.3 ms are none, whoever noticed the gap first; in one of 1 ms they are."""
+    limits = AxisLimits(12.0, INT32_MAX, INT32_MAX, INT32_MAX, INT32_MAX)
+    bench = Bench(limits=(limits, limits))
+    bench.loop.phase = Phase.CAM
+    bench.loop.begin_guarding()
+    for k in range(10):
+        bench.cycle(k * MS, 4 * k)
+    again_ns = 9 * MS + (gap_ns or MS)
+    if gap_ns:
+        # The host comes back shortly before the timer's SYNC is seen, and takes that for missing.
+        bench.loop.wake(again_ns - 200_000)
+        assert bench.loop.missing_syncs == 1
+    for k in range(10):
+        bench.cycle(again_ns + k * MS, 36 + 39 + 4 * k)
+    trips = {(trip.condition, trip.value) for trip in bench.loop.guard.tripped}
+    assert trips == (set() if gap_ns else {(Condition.VELOCITY, 38), (Condition.VELOCITY, 40)})
 
 
 @pytest.mark.parametrize("is_paced", [True, False])

@@ -23,7 +23,13 @@ PAPER = load_config("paper")
 PROFILE = compile_config(PAPER).profile
 UNITS = AxisUnits(4096, 0.0, 1.5)
 ENABLED, FAULT = 0x1237, 0x0218
-LIMITS = AxisLimits(velocity_counts_per_cycle=20.5, torque_permille=2500, frozen_counts=11, unanswered_permille=250)
+LIMITS = AxisLimits(
+    velocity_counts_per_cycle=20.5,
+    torque_permille=2500,
+    frozen_counts=11,
+    unanswered_permille=250,
+    pushed_permille=125,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,14 +309,28 @@ def leap(back_after=None, counts=110):
 
 
 def test_a_leap_that_stays_is_too_fast_and_a_glitch_that_goes_back_is_not():
-    # 20.5 counts a cycle, held for five: after five cycles the axis could have gone 102.5, and it is 110 + 4 * 4 away.
-    for track, tripped in ((leap(), 14), (leap(counts=-150), 14), (leap(11), None), (leap(13), None)):
+    # Twice 20.5 counts in a cycle are a leap, and must stay for five cycles.
+    for track, tripped, leapt in (
+        (leap(), 14, 110),
+        (leap(counts=-150), 14, -150),
+        (leap(11), None, 0),
+        (leap(13), None, 0),
+        (leap(counts=42), 14, 42),
+        (leap(counts=40), None, 0),
+    ):
         guard, axes, watch = make()
         assert run(watch, axes, guard, track) == tripped
         assert not tripped or guard.tripped[0].condition is Condition.VELOCITY
-    guard, axes, watch = make()
-    # 80 counts more than 4 a cycle are within reach in five cycles.
-    assert run(watch, axes, guard, leap(counts=80)) is None
+        assert [axis.leapt for axis in axes] == [0, leapt]
+        watch.begin()
+        assert axes[1].leapt == 0
+
+
+def test_the_noise_of_a_coarse_resolver_is_no_leap():
+    # A count and a half a cycle at most; it shows up to nine more, and comes back by halves, each for two cycles.
+    guard, axes, watch = make(replace(LIMITS, velocity_counts_per_cycle=1.5))
+    assert run(watch, axes, guard, [(n, n + (0, 9, 5, 0)[n // 2 % 4]) for n in range(100)]) is None
+    assert axes[1].leapt == 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +360,11 @@ class Push:
         Push(0, blows=(16,)),
         Push(0, blows=(8,)),
         Push(0, blows=(16, 24), tripped_at=25 + 7),
+        # 1 a cycle is above 125 from cycle 142 on, and half the limit is too much after 80 cycles of that.
+        Push(1, tripped_at=142 + 80 + 7),
+        Push(-1, tripped_at=142 + 80 + 7),
+        # A count in cycle 200 begins the standing anew.
+        Push(1, count_at=200),
     ],
 )
 def test_torque_that_grows_while_not_a_count_comes_of_it(push):

@@ -3,11 +3,29 @@
 import math
 
 import pytest
-from guarded_machine import CV, SERVO, Guarded, StopReason
+import yaml
+from guarded_machine import CV, PAPER, SERVO, Guarded, StopReason, at_theta2
 
+from config.loading import parse_config
+from config.schema import GatewayConfig
 from gateway.cyclic.guard import Condition
 from gateway.errors import CommissioningError
-from sim_drive.injection.faults import Fault, FaultKind
+from sim_drive.injection.faults import Direction, Fault, FaultKind
+
+LOOPS = {
+    "cv": {"proportional_Nm_per_rad": 20, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.3},
+    "servo": {"proportional_Nm_per_rad": 15, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.18},
+}
+
+
+def machine_in_torque() -> GatewayConfig:
+    """The paper's machine with the gateway's own, softer, position loops."""
+    document = yaml.safe_load(PAPER.text)
+    for name, gains in LOOPS.items():
+        document["axes"][name]["position_loop"] = {**gains, "torque_limit_Nm": 4.5}
+    document["guard"]["frozen_actual"]["limit_deg"] = 0.9
+    return parse_config(yaml.safe_dump(document), PAPER.path)
+
 
 FROZEN = (Condition.FROZEN_ACTUAL, Condition.UNANSWERED_TORQUE)
 
@@ -65,3 +83,114 @@ def test_a_resolver_that_leaps_at_rest_is_too_fast_for_its_axis(node, counts):
     run = Guarded(Fault(FaultKind.JUMPING_RESOLVER, node, 0.2, counts=counts)).to_end()
     assert run.stopped_by is StopReason.VELOCITY
     assert math.degrees(run.strain(0.2).cam_distance_rad) < 5.0
+
+
+@pytest.mark.parametrize("is_in_torque", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("node", "at_s", "for_s", "counts", "farthest_deg"),
+    [
+        # Back in the quick stop that it has led to, or not at all: up to 20 deg of the master, or 30 of the slave.
+        (CV, 3.145, 0.0885, -250, 6.0),
+        (CV, 1.0586, 0.003, 250, 4.0),
+        (SERVO, 2.18, 0.3, -500, 9.0),
+        pytest.param(CV, 3.86, 9.0, 500, 6.0, marks=pytest.mark.slow),
+        pytest.param(CV, 3.98, 9.0, -100, 9.0, marks=pytest.mark.slow),
+        pytest.param(CV, 1.666, 0.09, -500, 10.0, marks=pytest.mark.slow),
+        pytest.param(SERVO, 1.737, 9.0, 500, 9.0, marks=pytest.mark.slow),
+        pytest.param(SERVO, 2.778, 0.01, 500, 8.0, marks=pytest.mark.slow),
+        pytest.param(SERVO, 2.2, 0.02, 100, 6.0, marks=pytest.mark.slow),
+        pytest.param(SERVO, 3.2, 9.0, -60, 5.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_resolver_that_leaps_in_motion_stops_the_machine_near_its_cam(
+    is_in_torque, node, at_s, for_s, counts, farthest_deg
+):
+    fault = Fault(FaultKind.JUMPING_RESOLVER, node, at_s, for_s, counts=counts)
+    run = Guarded(fault, config=machine_in_torque() if is_in_torque else PAPER).to_end()
+    assert run.stopped_by in {StopReason.FOLLOWING_ERROR, StopReason.VELOCITY, StopReason.CAM_WINDOW}
+    assert run.is_without_torque
+    assert not run.is_torn
+    strain = run.strain(at_s)
+    assert strain.least_sine > 0.79
+    assert math.degrees(strain.cam_distance_rad) < farthest_deg
+    assert strain.rest_s < 0.2
+
+
+@pytest.mark.parametrize(
+    "at_s", [0.03, 0.12, 0.146, pytest.param(0.1, marks=pytest.mark.slow), pytest.param(0.14, marks=pytest.mark.slow)]
+)
+def test_an_axis_that_cannot_be_seen_to_carry_its_load_is_not_left_to_sink(at_s):
+    """0.146 s: the CV axis has torque, and has begun to take up its load."""
+    run = Guarded(Fault(FaultKind.FROZEN_RESOLVER, CV, at_s)).to_end()
+    assert isinstance(run.core.failure, CommissioningError)
+    assert "axis cv: holds with" in str(run.core.failure)
+    assert run.is_without_torque
+    assert math.degrees(run.strain(at_s).cam_distance_rad) < 2.0
+
+
+def leaps_at_the_bound():
+    """Of the leap limits, 23.7 counts of the CV axis and 42.4 of the servo axis: what is told, and what just is not."""
+    for node, counts in ((CV, (23, -24, 25)), (SERVO, (41, 42, -43, 44))):
+        for leap in counts:
+            for after_s in (0.006, 0.0095, 0.0137):
+                is_slow = not (node == SERVO and abs(leap) in (42, 43) and after_s < 0.01)
+                yield pytest.param(node, leap, after_s, marks=pytest.mark.slow if is_slow else ())
+
+
+@pytest.mark.parametrize(("node", "counts", "after_s"), list(leaps_at_the_bound()))
+@pytest.mark.parametrize("is_lost", [False, True])
+def test_a_small_leap_in_a_quick_stop_is_not_the_measure_of_what_comes_after_it(is_lost, node, counts, after_s):
+    at_s = at_theta2(335.0)
+    leap = Fault(FaultKind.JUMPING_RESOLVER, node, at_s + after_s, 9.0, counts=counts)
+    if is_lost:
+        run = Guarded(Fault(FaultKind.OVER_CURRENT, CV, at_s), leap, is_brakeless=True).to_end()
+    else:
+        run = Guarded(leap).until(at_s)
+        run.core.request_quick_stop()
+        run.bus.refresh()
+        run.to_end()
+    assert not run.is_torn
+    assert math.degrees(run.strain(at_s).cam_distance_rad) < 12.0
+    assert max(abs(axis.leapt) for axis in run.core.loop.axes) < 60
+
+
+def tpdo_lost(node, at_s):
+    return Fault(FaultKind.LOST_FRAMES, node, at_s, 0.0012, cob_id=0x180 + node, direction=Direction.SENT)
+
+
+@pytest.mark.parametrize("lost", ["way out", "way back"])
+@pytest.mark.parametrize(
+    ("node", "counts"),
+    [
+        (CV, 150),
+        (SERVO, -200),
+        pytest.param(CV, -100, marks=pytest.mark.slow),
+        pytest.param(SERVO, 150, marks=pytest.mark.slow),
+    ],
+)
+def test_a_glitch_beside_a_lost_tpdo_stops_nothing(node, counts, lost):
+    at_s = 2.2
+    glitch = Fault(FaultKind.JUMPING_RESOLVER, node, at_s, 0.003, counts=counts)
+    run = Guarded(glitch, tpdo_lost(node, at_s + (0.0029 if lost == "way back" else -0.0001))).to_end()
+    assert run.stopped_by is StopReason.COMPLETED
+    assert math.degrees(run.strain(at_s).cam_distance_rad) < 3.0
+    assert [axis.leapt for axis in run.core.loop.axes] == [0, 0]
+
+
+@pytest.mark.parametrize("lost", ["way out", "way back"])
+@pytest.mark.parametrize(("node", "counts"), [(CV, 150), (CV, -150), (SERVO, 150), (SERVO, -200)])
+def test_a_leap_beside_a_lost_tpdo_in_a_stop_takes_nothing_along(node, counts, lost):
+    """The CV axis runs out without torque and brake, the servo axis stays on its cam."""
+    at_s = at_theta2(335.0)
+    glitch = Fault(FaultKind.JUMPING_RESOLVER, node, at_s + 0.012, 0.005, counts=counts)
+    lost_at_s = at_s + (0.0169 if lost == "way back" else 0.0119)
+    run = Guarded(Fault(FaultKind.OVER_CURRENT, CV, at_s), glitch, tpdo_lost(node, lost_at_s), is_brakeless=True)
+    run.to_end()
+    assert math.degrees(run.strain(at_s).cam_distance_rad) < 8.0
+
+
+def test_many_glitches_leave_nothing_behind():
+    glitches = [Fault(FaultKind.JUMPING_RESOLVER, CV, 2.0 + 0.03 * n, 0.002, counts=60) for n in range(60)]
+    run = Guarded(*glitches, cycles=3).to_end()
+    assert run.stopped_by is StopReason.COMPLETED
+    assert not run.trips
