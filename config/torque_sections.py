@@ -51,6 +51,9 @@ class FeedForwardSection(Model):
     end_effector_mass_kg: Annotated[float, Field(ge=0.0, le=1000.0)] | None = None
     gravity_m_s2: Point | None = None
     axes: dict[AxisName, NominalAxisSection] = Field(default_factory=dict[AxisName, NominalAxisSection])
+    load_check_ms: Annotated[float, Field(ge=0.0, le=10_000.0)] = 50.0
+    """Within this after enabling an axis has to carry what the model says that it holds, or the run is refused: longer
+    than a brake takes to open after its drive says that it is enabled. 0 looks at no torque."""
 
 
 class LearnedAxisSection(Model):

@@ -19,6 +19,7 @@ from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
 from gateway.learning.law import Learning, build_learning
 from gateway.running.core import GatewayCore
 from gateway.running.drive_settings import axis_units, build_master, network_settings, node_settings, position_loop
+from gateway.running.load_check import build_load_check
 from gateway.running.machine_session import MachineSession
 from gateway.running.operation_setup import operation_limits, slave_law
 from gateway.running.powering import AxisSetup
@@ -143,6 +144,7 @@ def build_core(
         approach,
         config.recovery.timeout_s,
         config.recovery.bus_off_timeout_s,
+        build_load_check(config),
     )
     return GatewayCore(session, Operation(demand, operation_limits(config)), config.bus.sdo_frames_a_cycle)
 

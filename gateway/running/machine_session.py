@@ -30,6 +30,7 @@ from gateway.running.commissioning import (
     release_heartbeat,
     start_nodes,
 )
+from gateway.running.load_check import LoadCheck
 from gateway.running.powering import DISABLE_TIMEOUT_S, AxisPower, AxisSetup
 from gateway.running.recovery import Recovery
 from mechanism.approach import Point
@@ -84,12 +85,14 @@ class MachineSession:
         approach: Approach | None = None,
         recovery_timeout_s: float = 0.0,
         bus_off_timeout_s: float = 5.0,
+        load_check: LoadCheck | None = None,
     ) -> None:
         """``is_homing_again``: home the axes where they stand even if their drives are homed already.
 
         ``approach``: how a machine that does not stand where the plan begins gets onto its cam; None refuses it.
         ``recovery_timeout_s``: how long a node may be away after a stop before it is given up; 0 recovers nothing.
         ``bus_off_timeout_s``: how long the own controller may be bus-off before the bus is given up.
+        ``load_check``: of the axes at rest; None looks at no torque.
         """
         self.axes = axes
         self.network = network
@@ -117,6 +120,7 @@ class MachineSession:
         self._axis_of_node = {axis.node.node_id: axis for axis in axes}
         self._is_homing_again = is_homing_again
         self._approach = approach
+        self._load_check = load_check
         self._way: tuple[Point, ...] = ()
         """Corners of the approach; none where the machine stands at the plan's start."""
         self._recovery = (
@@ -129,6 +133,8 @@ class MachineSession:
             yield from self._commission()
             yield from self._home_all()
             yield from self._enable_all()
+            if self._load_check is not None:
+                yield from self._await_loads(self._load_check)
             self.is_interruptible = False
             yield from self._move()
         except OperatorStopError:
@@ -251,6 +257,14 @@ class MachineSession:
             for axis, stood, position in zip(self.axes, before, after, strict=True)
             if abs(position - stood) > (window := axis.channel.units.counts_in(START_WINDOW_RAD))
         ]
+
+    def _await_loads(self, check: LoadCheck) -> Procedure[None]:
+        """Standing under guard, for as long as it takes the axes to show that they carry their loads."""
+        check.begin([axis.channel for axis in self.axes])
+        while self.guard.reaction is None and not check.look():
+            if check.is_over:
+                raise CommissioningError(check.problems)
+            yield from self.power.cycles(1)
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.
