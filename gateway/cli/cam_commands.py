@@ -43,9 +43,10 @@ DOWNLOAD_EPILOG = """Examples, with an emulated machine in another terminal (sim
 
 
 def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
-    """Check a configuration: its keys, the cam against every limit, the bus budget. Nothing is opened or moved."""
+    """Check a configuration: its keys, the cam against every limit, bus budget, guard. Nothing is opened or moved."""
     from config.loading import load_config
     from gateway.running.bus_budget import budget_json, budget_table, budget_verdict
+    from gateway.running.guard_listing import drive_guards_text, guard_json, guard_table
     from gateway.running.preparation import prepare
 
     settings = load_config(config)
@@ -61,6 +62,7 @@ def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
                 "problems": problems,
                 "figures": figures,
                 "bus": budget_json(settings),
+                "guard": guard_json(settings),
                 "run": {
                     "duration_s": prepared.plan.duration_s,
                     "machine_cycles": settings.motion.machine_cycles,
@@ -127,6 +129,8 @@ def check(config: ConfigArgument, as_json: JsonOption = False) -> None:
         console.print(table)
         console.print(budget_table(settings))
         console.print(budget_verdict(settings), soft_wrap=True)
+        console.print(guard_table(settings))
+        console.print(drive_guards_text(settings), soft_wrap=True)
         console.print(
             f"run: {prepared.plan.duration_s:.2f} s, of which {settings.motion.machine_cycles} machine cycles or a "
             f"little more at constant speed ({prepared.plan.cruise_end_s - prepared.plan.cruise_start_s:.2f} s)"
