@@ -42,7 +42,7 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
             found = judge.judge()
             tally.take(seed, session, judge)
             is_torn = rig.plant.torn_at_s is not None
-            rig.settle(session)
+            rig.settle(session, is_reference_doubtful=bool(judge.unheld))
             # A linkage that nobody could hold may stand where no run can begin.
             rig.is_ready = judge.leaves_a_start
             found += judge.judge_truth()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from soak_scenario import CV, IN_MOTION, ORDER_OF, Mischief, Moment
+from soak_scenario import CV, IN_MOTION, ORDER_OF, SERVO, Mischief, Moment
 from soak_session import SECOND, TICK_S, Rig, Session
 
 from config.guard_section import Reaction
@@ -23,12 +23,15 @@ RUNNING_BOUND_DEG = 1.5
 CONTROLLED_BOUND_DEG = 3.0
 QUICK_BOUND_DEG = 16.0
 """Of a slave that has torque, sees, and is told where the master is: a brake stops a lost master faster than it can."""
-LOST_BOUND_DEG = 20.0
+LOST_BOUND_DEG = 26.0
+"""20 deg of the machine that the gateway knows: one axis stands at once, the other one as fast as its limits allow."""
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
 FROZEN_AT_REST_BOUND_DEG = 90.0
 FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
+LATE_IN_TORQUE_BOUND_DEG = 45.0
+"""A position loop that is closed over the bus swings up if all that it says and hears is late, or the bus too full."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
 """With orders, or on the way onto the cam, the demand itself comes nearer to a singular position; and so much more."""
@@ -50,6 +53,9 @@ MUST_STOP = (*TRIPS, FaultKind.NODE_RESET, FaultKind.BUS_OFF)
 SLAVE_UNABLE = {Mischief.HOST_AWAY, Mischief.HOST_LATE, Mischief.CONTROLLER_OFF}
 """Nobody tells the slave, for a while, where the master is."""
 ORDERS = tuple(ORDER_OF)
+FRAMES = (FaultKind.LATE_FRAMES, FaultKind.REORDERED_FRAMES, FaultKind.LOST_FRAMES, FaultKind.DOUBLED_FRAMES)
+SEEN_LEAP_COUNTS = {CV: 26, SERVO: 45}
+"""Twice the velocity limit of an axis, and noise: whatever leaps farther is known to have leapt."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,18 +271,13 @@ class Judge:
             self._say(f"{figures.running_deg:.1f} deg from the cam with nothing amiss (bound {RUNNING_BOUND_DEG:g})")
         if self.unheld:
             return
-        least = min(LEAST_SINE, figures.first_sine - STANDING_SINE_LOSS)
-        if not self.session.is_law_plain or Phase.APPROACH in self.phases:
-            least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
-        least = min(least, FROZEN_AT_REST_SINE) if self.is_frozen_at_rest else least
+        least = self._least_sine()
         if not figures.least_sine > least:
             self._say(f"least sine {figures.least_sine:.3f} (bound {least:.2f})")
         if self.stop == "none":
             return
-        lost = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
-        if self.is_frozen_at_rest:
-            lost = FROZEN_AT_REST_BOUND_DEG
-        bound = {"controlled": CONTROLLED_BOUND_DEG, "quick": QUICK_BOUND_DEG}.get(self.stop, lost) + self._jumped_deg()
+        bounds = {"controlled": CONTROLLED_BOUND_DEG, "quick": QUICK_BOUND_DEG}
+        bound = bounds.get(self.stop, self._lost_bound_deg()) + self._jumped_deg()
         if figures.cam_deg > bound:
             self._say(f"{figures.cam_deg:.1f} deg from the cam in a {self.stop} stop (bound {bound:.1f})")
         rest = {"controlled": CONTROLLED_REST_S, "killed": KILLED_REST_S}.get(self.stop, QUICK_REST_S)
@@ -290,13 +291,33 @@ class Judge:
         if figures.shaft_torque_Nm > TORQUE_BOUND_NM:
             self._say(f"{figures.shaft_torque_Nm:.1f} N m on a shaft in a {self.stop} stop (bound {TORQUE_BOUND_NM:g})")
 
+    def _least_sine(self) -> float:
+        least = min(LEAST_SINE, self.figures.first_sine - STANDING_SINE_LOSS)
+        if not self.session.is_law_plain or Phase.APPROACH in self.phases:
+            least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
+        if self.is_frozen_at_rest:
+            least = min(least, FROZEN_AT_REST_SINE)
+        return least
+
+    def _lost_bound_deg(self) -> float:
+        bound = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
+        if self.is_frozen_at_rest:
+            bound = FROZEN_AT_REST_BOUND_DEG
+        return max(bound, LATE_IN_TORQUE_BOUND_DEG) if self._is_late_in_torque() else bound
+
+    def _is_in_torque(self) -> bool:
+        return any(axis.position_loop is not None for axis in self.rig.config.ordered_axes)
+
+    def _is_late_in_torque(self) -> bool:
+        return self._is_in_torque() and any(fault.kind in FRAMES for fault, _ in self.faults)
+
     def _jumped_deg(self) -> float:
-        """How far drives whose resolvers jumped have carried their links before anybody could know."""
+        """How far drives have carried their links whose resolvers leapt by less than can be known."""
         slope = float(np.abs(self.session.prepared.cam.profile.at_many(np.linspace(0.0, math.tau, 360))[:, 1]).max())
         return sum(
             abs(fault.counts or 0) * 360.0 / 4096 * (slope if fault.node_id == CV else 1.0)
             for fault, _ in self.faults
-            if fault.kind is FaultKind.JUMPING_RESOLVER
+            if fault.kind is FaultKind.JUMPING_RESOLVER and abs(fault.counts or 0) <= SEEN_LEAP_COUNTS[fault.node_id]
         )
 
     def _least_commanded_sine(self) -> float:

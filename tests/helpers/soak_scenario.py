@@ -160,8 +160,12 @@ def _document(rpm: int, curve: Path, is_learning: bool, is_torque_controlled: bo
     if is_torque_controlled:
         for name, gains in TORQUE_LOOPS.items():
             document["axes"][name]["position_loop"] = gains
-        # These loops are softer than the drives': friction keeps the servo axis where it stands for up to 4 counts.
-        document["guard"]["frozen_actual"]["limit_deg"] = 0.5
+        # These loops are softer than the drives': friction keeps the servo axis where it stands for up to 8 counts.
+        document["guard"]["frozen_actual"]["limit_deg"] = 0.9
+        # And drives that are told no torque go on with the last one.
+        document["guard"]["sync_lost"]["limit_cycles"] = 6
+        for axis in document["axes"].values():
+            axis["sync_watchdog"]["cycles"] = 12
     return document
 
 
@@ -315,7 +319,9 @@ COMMISSIONING_ONLY = (FaultKind.WRONG_IDENTITY, FaultKind.SDO_ABORT)
 def _parameters(source: Random, kind: FaultKind, node: int) -> dict[str, Any]:
     match kind:
         case FaultKind.JUMPING_RESOLVER:
-            return {"counts": source.choice((-250, -100, -40, -15, 15, 40, 100, 250))}
+            # About where a leap begins to be told from motion, and far from there.
+            counts = source.choice((15, 40, 100, 250, source.randint(20, 60), source.randint(20, 60)))
+            return {"counts": source.choice((-1, 1)) * counts}
         case FaultKind.SLOW_SDO:
             return {"delay_s": source.uniform(0.001, 0.3)}
         case FaultKind.SDO_ABORT:

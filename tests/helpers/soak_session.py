@@ -256,9 +256,9 @@ class Rig:
     def is_powered(self) -> bool:
         return any(drive.is_powered for drive in self.machine.drives)
 
-    def settle(self, session: Session) -> float:
-        """Wait until no fault is at work any more, and bring the linkage home by hand where a run could not go on;
-        returns how long that took, s.
+    def settle(self, session: Session, is_reference_doubtful: bool) -> float:
+        """Wait until no fault is at work any more, and bring the linkage home by hand where a run could not go on, or
+        where nobody could know that a reference was wrong; returns how long that took, s.
         """
         since_ns = self.now_ns
         while self.injector.active and self.now_ns < since_ns + 10 * SECOND:
@@ -268,7 +268,7 @@ class Rig:
         outcomes = [event for event in session.events if isinstance(event, AxisRecovered)]
         session.unhomed = tuple(n for n, axis in enumerate(self.machine.drive_axes) if not axis.is_homed)
         is_ready = session.core.failure is None and all(event.is_ready for event in outcomes)
-        self.is_homing_again = not is_ready or bool(session.unhomed)
+        self.is_homing_again = not is_ready or bool(session.unhomed) or is_reference_doubtful
         if self.is_homing_again:
             turns = round(self.plant.angle(0) / math.tau) * math.tau
             self.plant.set_motion((turns, 0.0), (0.0, 0.0))
