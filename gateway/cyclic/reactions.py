@@ -74,8 +74,13 @@ class _SeenAxis:
         cycles = self.unseen_cycles + 1
         self.unseen_cycles = 0
         expected = self._way * cycles
-        if cycles <= LEAP_GAP_CYCLES + 1 and axis.sees_leap(moved, expected):
-            return expected
+        if cycles <= LEAP_GAP_CYCLES + 1:
+            if axis.sees_leap(moved, expected):
+                return expected
+        elif abs(moved + axis.leapt - expected) < abs(moved - expected):
+            # How far it has gone is anybody's guess, but not that a leap has gone back meanwhile.
+            moved += axis.leapt
+            axis.leapt = 0
         # A leap too small to be told must not become the measure of the next way: no axis gets so much faster at once.
         slack = axis.leap_limit / WAY_SHARE
         self._way += min(max(moved / cycles - self._way, -slack), slack)

@@ -121,6 +121,23 @@ def test_a_way_gone_in_silence_is_no_leap():
     assert stop.master_position == pytest.approx(200 * math.tau / 4096, abs=0.01)
 
 
+@pytest.mark.parametrize(("back", "left"), [(250, 0), (0, -250)])
+def test_a_leap_that_goes_back_while_no_sync_was_sent_has_gone_back(back, left):
+    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
+    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    for channel in channels:
+        channel.leap_limit = 20.0
+    stop.begin(0.0, math.tau, [0, 0])
+    for cycle in [*range(10), *range(18, 60)]:
+        for channel in channels:
+            channel.actual = round(4.096 * cycle) - (250 if cycle >= 5 else 0) + (back if cycle >= 18 else 0)
+        if cycle == 18:
+            stop.skip(8)
+        stop.step()
+    assert channels[0].leapt == pytest.approx(left, abs=2)
+    assert stop.master_position == pytest.approx(math.tau * 0.059, abs=0.01)
+
+
 @pytest.mark.parametrize("leapt", [0, -250])
 @pytest.mark.parametrize(
     ("is_in_torque", "away_deg", "is_stopped"), [(True, 11, True), (True, 9, False), (False, 11, False)]
