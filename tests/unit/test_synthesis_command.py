@@ -236,7 +236,9 @@ def test_the_machine_found_runs_in_virtual_time_and_is_reported(run):
     for value in (f"{document['variables']['p_mm']:.2f}", f"{document['figures']['displacement_deg']:.2f}°"):
         assert value in page
     status, _, err = run("run", "m.yaml", "--virtual-time", "--cycles", "2", "-r", "m.mcap")
-    assert (status, err.splitlines()[-3]) == (0, "done")
+    # Heartbeats may still tell of the nodes' last state.
+    assert status == 0
+    assert "done" in err.splitlines()[-3:]
 
 
 @pytest.mark.slow
