@@ -270,11 +270,16 @@ class CycleWatch:
 
     def _check_velocity(self, number: int, watched: _WatchedAxis, target: int, moved: int, now_ns: int) -> None:
         """A leap of the resolver counts until it goes back."""
-        guard, bound, axis = self._guard, watched.velocity, watched.axis
+        guard, axis = self._guard, watched.axis
+        if not (moved or axis.leapt):
+            if not guard.is_quiet and watched.is_fresh:
+                guard.clear(Condition.VELOCITY, number)
+            return
         if watched.is_known:
             axis.sees_leap(moved, _way(watched.target, target))
         if not watched.is_fresh:
             return
+        bound = watched.velocity
         if not -bound <= moved <= bound:
             guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
         elif 2.0 * abs(axis.leapt) > axis.leap_limit:
@@ -298,10 +303,11 @@ class CycleWatch:
         if watched.settling:
             watched.settling -= 1
             return False
-        # A demand that comes back to an axis that stands, as after an overshoot, asks nothing of it.
-        away = abs(_way(watched.axis.actual, target)) - abs(_way(watched.axis.actual, watched.target))
-        if away > 0:
-            watched.travelled += away
+        if target != watched.target:
+            # A demand that comes back to an axis that stands, as after an overshoot, asks nothing of it.
+            away = abs(_way(watched.axis.actual, target)) - abs(_way(watched.axis.actual, watched.target))
+            if away > 0:
+                watched.travelled += away
         if watched.travelled > watched.frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
         return True
