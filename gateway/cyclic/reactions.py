@@ -29,6 +29,8 @@ WATCHED_S: Final = 0.1
 """So long a master takes that brakes; behind one that runs out, dry friction holds a slave for longer than a resolver
 may be still."""
 MAX_SKIPPED: Final = 1000
+CALM_CYCLES: Final = 5
+"""A target that jumps is sent, applied, reached, and, where SYNC is missing, overshot; so long no drive is to stop."""
 LED_RAD: Final = math.radians(10.0)
 """Farther from its target a slave whose position loop is closed here is not led by it: its own drive brakes better."""
 POSITION_GAIN: Final = 0.7
@@ -114,6 +116,9 @@ class CoupledStop:
         """Where the master was seen last, rad."""
         self._rest_from = 0
         self._rest_cycles = 0
+        self._leapt = 0
+        """What the slave's resolver shows too much, as it is in its target, and for how many cycles it has been so."""
+        self._calm_cycles = 0
         self.targets = [0, 0]
         self.torque_offsets = [0, 0]
         self.velocities = [0.0, 0.0]
@@ -132,6 +137,8 @@ class CoupledStop:
         master, slave = self._master, self._slave
         self.targets = list(targets)
         self._slave_targets = [targets[SLAVE]] * len(self._slave_targets)
+        self._leapt = 0
+        self._calm_cycles = CALM_CYCLES
         self._cycle = 0
         self._rest_cycles = 0
         self.is_finished = False
@@ -171,7 +178,7 @@ class CoupledStop:
             master.controlword = COMMAND_DISABLE_VOLTAGE
         if disabled >> SLAVE & 1:
             slave.controlword = COMMAND_DISABLE_VOLTAGE
-        elif self.is_finished or self._is_lost(slave) or not self._is_led(slave):
+        elif self._is_lost(slave) or (self._is_calm(slave) and (self.is_finished or not self._is_led(slave))):
             slave.controlword = COMMAND_QUICK_STOP
         if self.is_finished:
             return
@@ -206,6 +213,15 @@ class CoupledStop:
     @staticmethod
     def _is_lost(axis: AxisChannel) -> bool:
         return axis.silent_cycles == 0 and axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED
+
+    def _is_calm(self, slave: AxisChannel) -> bool:
+        """Whether its drive has had targets without a jump for a while: its own stop begins with their speed."""
+        if slave.leapt != self._leapt:
+            self._leapt = slave.leapt
+            self._calm_cycles = 0
+            return False
+        self._calm_cycles += 1
+        return self._calm_cycles > CALM_CYCLES
 
     def _is_led(self, slave: AxisChannel) -> bool:
         if slave.position_loop is None or slave.silent_cycles:

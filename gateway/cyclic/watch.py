@@ -75,6 +75,7 @@ class _WatchedAxis:
         "frozen_counts",
         "is_fresh",
         "is_known",
+        "nearest",
         "pushed",
         "pushed_cycles",
         "settling",
@@ -82,7 +83,6 @@ class _WatchedAxis:
         "still_torques",
         "target",
         "torque",
-        "travelled",
         "unanswered",
         "velocity",
     )
@@ -100,8 +100,8 @@ class _WatchedAxis:
         self.actual = 0
         self.target = 0
         self.error = 0
-        self.travelled = 0
-        """Counts that the demand has gone away from the actual value since that changed last."""
+        self.nearest = INT32_MAX
+        """Counts that the demand has been nearest to the actual value since that changed last."""
         self.still_cycles = 0
         """Cycles since the actual value changed last."""
         self.still_torques = [(0, 0)] * len(STILL_CYCLES)
@@ -244,7 +244,8 @@ class CycleWatch:
             if self._check_answer(number, watched, target, moved, now_ns):
                 self._check_push(number, watched, torque_offset, now_ns)
         else:
-            watched.travelled = watched.still_cycles = 0
+            watched.nearest = INT32_MAX
+            watched.still_cycles = 0
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
         """A resolver that dies in a stop is as bad as in a run."""
@@ -295,7 +296,8 @@ class CycleWatch:
         guard = self._guard
         if not watched.is_fresh or moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
             # A drive that has had no new target stands, whatever its resolver shows.
-            watched.travelled = watched.still_cycles = 0
+            watched.nearest = INT32_MAX
+            watched.still_cycles = 0
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)
                 guard.clear(Condition.UNANSWERED_TORQUE, number)
@@ -303,13 +305,13 @@ class CycleWatch:
         if watched.settling:
             watched.settling -= 1
             return False
+        actual = watched.axis.actual
         if target != watched.target:
             # A demand that comes back to an axis that stands, as after an overshoot, asks nothing of it.
-            away = abs(_way(watched.axis.actual, target)) - abs(_way(watched.axis.actual, watched.target))
-            if away > 0:
-                watched.travelled += away
-        if watched.travelled > watched.frozen_counts:
-            guard.hold(Condition.FROZEN_ACTUAL, number, watched.travelled, watched.frozen_counts, now_ns)
+            watched.nearest = min(watched.nearest, abs(_way(actual, watched.target)))
+        travelled = abs(_way(actual, target)) - watched.nearest
+        if travelled > watched.frozen_counts:
+            guard.hold(Condition.FROZEN_ACTUAL, number, travelled, watched.frozen_counts, now_ns)
         return True
 
     def _check_push(self, number: int, watched: _WatchedAxis, torque_offset: int, now_ns: int) -> None:

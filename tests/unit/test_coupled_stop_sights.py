@@ -161,6 +161,31 @@ def test_a_slave_that_the_gateways_loop_does_not_get_near_its_cam_is_left_to_its
     slave.actual = target + round(away_deg / 360.0 * 4096)
     stop.begin(0.0, 0.0, [0, target])
     slave.actual += leapt
-    stop.step()
-    stop.step()
+    for _ in range(10):
+        stop.step()
     assert (slave.controlword == COMMAND_QUICK_STOP) == is_stopped
+
+
+def test_no_drive_is_told_to_stop_while_its_target_jumps():
+    """Its stop begins with the speed of its targets: 250 counts within a millisecond are 384 rad/s."""
+    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
+    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    slave = channels[1]
+    target = slave.units.counts(LAW.at(0.0)[0])
+    for back_in in range(40, 60):
+        for channel in channels:
+            channel.leap_limit, channel.leapt = 40.0, 0
+            channel.statusword, channel.controlword = 0x1237, COMMAND_ENABLE_OPERATION
+        channels[0].actual, slave.actual = 0, target
+        stop.begin(0.0, 0.0, [0, target])
+        stopped_in, jumped_in = None, 0
+        for cycle in range(70):
+            slave.actual = target - (250 if 5 <= cycle < back_in else 0)
+            before = stop.targets[1]
+            stop.step()
+            jumped_in = cycle if stop.targets[1] != before else jumped_in
+            if slave.controlword == COMMAND_QUICK_STOP:
+                stopped_in = cycle
+                break
+        assert stopped_in is not None
+        assert stopped_in > jumped_in + 4

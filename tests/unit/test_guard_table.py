@@ -326,6 +326,15 @@ def test_a_leap_that_stays_is_too_fast_and_a_glitch_that_goes_back_is_not():
         assert axes[1].leapt == 0
 
 
+def test_a_demand_that_comes_back_or_dithers_is_no_dead_resolver():
+    """It stands at 0; the demand comes from 10 counts away, and dithers by one for long, but never goes 12 away."""
+    guard, axes, watch = make()
+    track = [(10 - n, 0) for n in range(10)] + [(n % 2, 0) for n in range(100)] + [(-n, 0) for n in range(12)]
+    assert run(watch, axes, guard, track) is None
+    assert run(watch, axes, guard, [(-12, 0)] * 4) == 3
+    assert guard.tripped[0].condition is Condition.FROZEN_ACTUAL
+
+
 def test_the_noise_of_a_coarse_resolver_is_no_leap():
     # A count and a half a cycle at most; it shows up to nine more, and comes back by halves, each for two cycles.
     guard, axes, watch = make(replace(LIMITS, velocity_counts_per_cycle=1.5))

@@ -194,3 +194,19 @@ def test_many_glitches_leave_nothing_behind():
     run = Guarded(*glitches, cycles=3).to_end()
     assert run.stopped_by is StopReason.COMPLETED
     assert not run.trips
+
+
+@pytest.mark.parametrize(
+    "back_s",
+    [0.078, 0.079, *(pytest.param(0.05 + 0.001 * n, marks=pytest.mark.slow) for n in range(40) if n not in (28, 29))],
+)
+def test_a_leap_that_goes_back_as_the_stop_ends_does_not_set_the_slave_off(back_s):
+    """The slave's drive is told to stop when the master has stood for 50 ms, and not with a target that jumps."""
+    run = Guarded(Fault(FaultKind.JUMPING_RESOLVER, SERVO, 2.205, back_s - 0.005, counts=-100)).until(2.2)
+    run.core.request_quick_stop()
+    run.bus.refresh()
+    run.to_end()
+    assert not run.is_torn
+    strain = run.strain(2.2)
+    assert math.degrees(strain.cam_distance_rad) < 4.0
+    assert strain.least_sine > 0.79
