@@ -101,6 +101,11 @@ class GuardTripped(Event):
     reaction: Reaction
 
 
+def persistence_cycles(rule: object) -> int:
+    """For how many cycles in a row a condition of the configuration's guard section must hold; an event: once."""
+    return rule.persistence_cycles if isinstance(rule, ConditionSection) else 1
+
+
 class Guard:
     """Counts how long conditions hold; one counter for each condition and axis."""
 
@@ -108,10 +113,7 @@ class Guard:
         rules: dict[Condition, ConditionSection | StopSection] = {
             condition: getattr(section, condition.value) for condition in Condition
         }
-        self._persistence = {
-            condition: rule.persistence_cycles if isinstance(rule, ConditionSection) else 1
-            for condition, rule in rules.items()
-        }
+        self._persistence = {condition: persistence_cycles(rule) for condition, rule in rules.items()}
         self._reaction = {condition: rule.reaction for condition, rule in rules.items()}
         self._warning_codes = section.emergency_warning.codes
         self._axis_names = axis_names

@@ -16,7 +16,7 @@ from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, AxisChannel
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK
 from gateway.record.sample import Phase
-from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
+from gateway.units import wrap_counts
 from mechanism.slave_law import SlaveLaw
 
 REACHED_AFTER_CYCLES: Final = 2
@@ -29,6 +29,7 @@ WATCHED_S: Final = 0.1
 """So long a master takes that brakes; behind one that runs out, dry friction holds a slave for longer than a resolver
 may be still."""
 MAX_SKIPPED: Final = 1000
+"""Cycles after which a master that nobody has seen stands, or is anywhere."""
 CALM_CYCLES: Final = 5
 """A target that jumps is sent, applied, reached, and, where SYNC is missing, overshot; so long no drive is to stop."""
 LED_RAD: Final = math.radians(10.0)
@@ -71,7 +72,7 @@ class _SeenAxis:
     def look(self) -> float:
         """Counts gone since it was seen last, now that it is seen again."""
         axis = self._axis
-        moved = (axis.actual - self._actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
+        moved = wrap_counts(axis.actual - self._actual)
         self._actual = axis.actual
         cycles = self.unseen_cycles + 1
         self.unseen_cycles = 0
@@ -174,11 +175,14 @@ class CoupledStop:
             self._seen_slave.unseen_cycles += 1
         else:
             self._seen_slave.look()
+        self._note_jump(slave.leapt)
         if disabled >> MASTER & 1:
             master.controlword = COMMAND_DISABLE_VOLTAGE
         if disabled >> SLAVE & 1:
             slave.controlword = COMMAND_DISABLE_VOLTAGE
-        elif self._is_lost(slave) or (self._is_calm(slave) and (self.is_finished or not self._is_led(slave))):
+        elif self._is_lost(slave) or (
+            self._calm_cycles > CALM_CYCLES and (self.is_finished or not self._is_led(slave))
+        ):
             slave.controlword = COMMAND_QUICK_STOP
         if self.is_finished:
             return
@@ -214,14 +218,10 @@ class CoupledStop:
     def _is_lost(axis: AxisChannel) -> bool:
         return axis.silent_cycles == 0 and axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED
 
-    def _is_calm(self, slave: AxisChannel) -> bool:
-        """Whether its drive has had targets without a jump for a while: its own stop begins with their speed."""
-        if slave.leapt != self._leapt:
-            self._leapt = slave.leapt
-            self._calm_cycles = 0
-            return False
-        self._calm_cycles += 1
-        return self._calm_cycles > CALM_CYCLES
+    def _note_jump(self, leapt: int) -> None:
+        """A leap makes the slave's target jump, and its drive's own stop begins with the speed of its targets."""
+        self._calm_cycles = self._calm_cycles + 1 if leapt == self._leapt else 0
+        self._leapt = leapt
 
     def _is_led(self, slave: AxisChannel) -> bool:
         if slave.position_loop is None or slave.silent_cycles:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, AxisChannel
 from gateway.cyclic.guard import Condition, Guard
 from gateway.record.sample import INT32_MAX, Phase
-from gateway.units import HALF_RANGE, RANGE_MASK
+from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
 from mechanism.deviation import end_effector_miss
 from mechanism.slave_law import SlaveLaw
 
@@ -249,7 +249,7 @@ class CycleWatch:
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
         """A resolver that dies in a stop is as bad as in a run."""
-        moved = _way(watched.actual, watched.axis.actual)
+        moved = wrap_counts(watched.axis.actual - watched.actual)
         self._check_answer(number, watched, target, moved, now_ns)
 
     def _check_drive(self, number: int, watched: _WatchedAxis, now_ns: int) -> None:
@@ -277,7 +277,7 @@ class CycleWatch:
                 guard.clear(Condition.VELOCITY, number)
             return
         if watched.is_known:
-            axis.sees_leap(moved, _way(watched.target, target))
+            axis.sees_leap(moved, wrap_counts(target - watched.target))
         if not watched.is_fresh:
             return
         bound = watched.velocity
@@ -308,8 +308,8 @@ class CycleWatch:
         actual = watched.axis.actual
         if target != watched.target:
             # A demand that comes back to an axis that stands, as after an overshoot, asks nothing of it.
-            watched.nearest = min(watched.nearest, abs(_way(actual, watched.target)))
-        travelled = abs(_way(actual, target)) - watched.nearest
+            watched.nearest = min(watched.nearest, abs(wrap_counts(watched.target - actual)))
+        travelled = abs(wrap_counts(target - actual)) - watched.nearest
         if travelled > watched.frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, travelled, watched.frozen_counts, now_ns)
         return True
@@ -369,11 +369,6 @@ class CycleWatch:
             )
         elif not guard.is_quiet:
             guard.clear(Condition.END_EFFECTOR_ERROR, 0)
-
-
-def _way(before: int, after: int) -> int:
-    """Counts from one position to the next."""
-    return (after - before + HALF_RANGE & RANGE_MASK) - HALF_RANGE
 
 
 def _counts(value: float, unit: float) -> int:

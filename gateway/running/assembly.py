@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from config.conversion import closure_at_home, five_bar, nominal_parameters
+from config.conversion import closure_at_home, five_bar
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
 from gateway.cyclic.axis_channel import AxisChannel
@@ -18,7 +18,14 @@ from gateway.cyclic.torque_offsets import build_torque_offsets
 from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
 from gateway.learning.law import Learning, build_learning
 from gateway.running.core import GatewayCore
-from gateway.running.drive_settings import axis_units, build_master, network_settings, node_settings, position_loop
+from gateway.running.drive_settings import (
+    axis_units,
+    build_master,
+    lasting_pushes,
+    network_settings,
+    node_settings,
+    position_loop,
+)
 from gateway.running.load_check import build_load_check
 from gateway.running.machine_session import MachineSession
 from gateway.running.operation_setup import operation_limits, slave_law
@@ -27,6 +34,7 @@ from gateway.running.preparation import plan
 from mechanism.approach import ApproachField
 from mechanism.cam_profile import CamProfile
 from mechanism.deviation import harmless_error
+from mechanism.five_bar import Closure
 from mechanism.motion import MasterPlan
 from mechanism.slave_law import SlaveLaw
 
@@ -47,9 +55,9 @@ def guard_limits(config: GatewayConfig, law: SlaveLaw) -> tuple[list[AxisLimits]
             torque_permille=guard.torque.limit_permille,
             frozen_counts=round(guard.frozen_actual.limit_deg / 360.0 * axis.counts_per_revolution),
             unanswered_permille=guard.unanswered_torque.limit_permille,
-            pushed_permille=guard.unanswered_torque.lasting_permille(axis_units(axis).permille(friction)),
+            pushed_permille=pushed,
         )
-        for axis, friction in zip(config.ordered_axes, nominal_parameters(config).coulomb_N_m, strict=True)
+        for axis, pushed in zip(config.ordered_axes, lasting_pushes(config), strict=True)
     ]
     master, slave = config.ordered_axes
     geometry, closure = five_bar(config).to_array(), int(closure_at_home(config))
@@ -105,7 +113,8 @@ def build_core(
     ]
     guard = Guard(config.guard, config.axis_names)
     law = slave_law(config, profile)
-    watch = CycleWatch(guard, channels, *guard_limits(config, law))
+    limits, window = guard_limits(config, law)
+    watch = CycleWatch(guard, channels, limits, window)
     deceleration = config.ordered_axes[0].limits.quick_stop_deceleration_rad_per_s2
     coupled_stop = CoupledStop(
         law,
@@ -144,7 +153,7 @@ def build_core(
         approach,
         config.recovery.timeout_s,
         config.recovery.bus_off_timeout_s,
-        build_load_check(config),
+        build_load_check(config, Closure(window.closure)),
     )
     return GatewayCore(session, Operation(demand, operation_limits(config)), config.bus.sdo_frames_a_cycle)
 

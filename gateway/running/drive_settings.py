@@ -3,6 +3,7 @@
 import math
 from typing import Final
 
+from config.conversion import nominal_parameters
 from config.schema import AxisSection, GatewayConfig
 from drivers.master import Master
 from drivers.object_dictionary import DataType
@@ -17,6 +18,15 @@ _UNSIGNED: Final = {8: DataType.UNSIGNED8, 16: DataType.UNSIGNED16, 32: DataType
 def axis_units(axis: AxisSection) -> AxisUnits:
     """The converter of one axis."""
     return AxisUnits(axis.counts_per_revolution, math.radians(axis.home_angle_deg), axis.rated_torque_Nm)
+
+
+def lasting_pushes(config: GatewayConfig) -> list[int]:
+    """Torques that nothing may come of for long (per mille of rated torque), one an axis, master first."""
+    rule, friction = config.guard.unanswered_torque, nominal_parameters(config).coulomb_N_m
+    return [
+        rule.lasting_permille(axis_units(axis).permille(dry))
+        for axis, dry in zip(config.ordered_axes, friction, strict=True)
+    ]
 
 
 def _quick_stop_deceleration(axis: AxisSection) -> int | None:

@@ -6,11 +6,9 @@ from typing import Any
 
 from rich.table import Table
 
-from config.conversion import nominal_parameters
 from config.guard_section import (
     AngleCondition,
     CodesCondition,
-    ConditionSection,
     CyclesCondition,
     LengthCondition,
     PercentCondition,
@@ -19,9 +17,9 @@ from config.guard_section import (
     TorqueCondition,
 )
 from config.schema import AxisSection, GatewayConfig
-from gateway.cyclic.guard import Condition
+from gateway.cyclic.guard import Condition, persistence_cycles
 from gateway.cyclic.watch import PUSHED_CYCLES
-from gateway.running.drive_settings import axis_units
+from gateway.running.drive_settings import lasting_pushes
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +37,8 @@ def guard_rows(config: GatewayConfig) -> list[GuardRow]:
     rows: list[GuardRow] = []
     for condition in Condition:
         rule = getattr(config.guard, condition.value)
-        cycles = rule.persistence_cycles if isinstance(rule, ConditionSection) else 1
-        rows.append(GuardRow(condition, _limit(config, condition, rule), cycles, rule.reaction))
+        limit = _limit(config, condition, rule)
+        rows.append(GuardRow(condition, limit, persistence_cycles(rule), rule.reaction))
     return rows
 
 
@@ -125,9 +123,5 @@ def _limit(config: GatewayConfig, condition: Condition, rule: object) -> str:
 def _lasting(config: GatewayConfig, rule: TorqueCondition) -> str:
     if not isinstance(rule, PushCondition):
         return ""
-    friction = nominal_parameters(config).coulomb_N_m
-    lasting = [
-        f"{name} {rule.lasting_permille(axis_units(axis).permille(dry))}"
-        for name, axis, dry in zip(config.axis_names, config.ordered_axes, friction, strict=True)
-    ]
+    lasting = [f"{name} {permille}" for name, permille in zip(config.axis_names, lasting_pushes(config), strict=True)]
     return f"; for {PUSHED_CYCLES} cycles {', '.join(lasting)} per mille"

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
-from config.conversion import closure_at_home, nominal_parameters
+from config.conversion import nominal_parameters
 from config.schema import GatewayConfig
 from gateway.cyclic.axis_channel import AxisChannel
-from mechanism.dynamics import inverse_dynamics
+from mechanism.dynamics import Dynamics
+from mechanism.five_bar import Closure
 
 LEAST_LOAD_PERMILLE: Final = 50
 """Of rated torque: less is held by friction that no model has."""
@@ -96,16 +97,16 @@ class LoadCheck:
         ]
 
 
-def build_load_check(config: GatewayConfig) -> LoadCheck | None:
+def build_load_check(config: GatewayConfig, closure: Closure) -> LoadCheck | None:
     """Of a machine whose model is good enough to be fed forward; None for any other."""
     span_ms = config.feed_forward.load_check_ms
     if not (config.feed_forward.enabled and span_ms):
         return None
     parameters = nominal_parameters(config)
-    array, closure = parameters.to_array(), int(closure_at_home(config))
-    coulomb_velocity = config.feed_forward.coulomb_velocity_rad_per_s
+    model = Dynamics(parameters, closure)
+    at_rest = 0.0, 0.0
 
     def torques(theta2: float, theta5: float) -> tuple[float, float]:
-        return inverse_dynamics(array, theta2, theta5, 0.0, 0.0, 0.0, 0.0, closure, coulomb_velocity)
+        return model.torque((theta2, theta5), at_rest, at_rest)
 
     return LoadCheck(torques, parameters.coulomb_N_m, round(span_ms * 1000.0 / config.bus.cycle_us))

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from torque_loops import TORQUE_LOOPS
 
 from config.conversion import closure_at_home, five_bar
 from config.loading import load_config
@@ -173,22 +174,6 @@ def gateway_texts() -> list[str]:
     """Every configuration of a gateway that a campaign may draw."""
     ways = itertools.product((60, 45, 30), CURVES, (False, True), (False, True))
     return [yaml.safe_dump(_document(*way)) for way in ways]
-
-
-TORQUE_LOOPS = {
-    "cv": {
-        "proportional_Nm_per_rad": 20,
-        "integrating_Nm_per_rad_s": 60,
-        "derivative_Nms_per_rad": 0.3,
-        "torque_limit_Nm": 4.5,
-    },
-    "servo": {
-        "proportional_Nm_per_rad": 15,
-        "integrating_Nm_per_rad_s": 60,
-        "derivative_Nms_per_rad": 0.18,
-        "torque_limit_Nm": 4.5,
-    },
-}
 
 
 def _make_otherwise(document: dict[str, Any], source: Random) -> None:

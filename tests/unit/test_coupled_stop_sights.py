@@ -18,11 +18,18 @@ CONFIG = load_config("paper")
 LAW = SlaveLaw(compile_config(CONFIG).profile)
 
 
+def make_stop(leap_limit=math.inf):
+    """Of the paper's machine, whose master does not brake while it is not seen; and its channels."""
+    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
+    for channel in channels:
+        channel.leap_limit = leap_limit
+    return CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0), channels
+
+
 @pytest.mark.parametrize("apart", [1, 2, 6, 20, 50])
 def test_rare_sights_of_the_master_do_not_make_its_velocity_swing_up(apart):
     """It coasts at 1 rev/s, seen every so many cycles: what the observer takes for its speed stays near that."""
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    stop, channels = make_stop()
     master = channels[0]
     stop.begin(0.0, math.tau, [0, 0])
     for cycle in range(1, 2001):
@@ -41,10 +48,7 @@ def leaping_stop(leaps, speed=math.tau):
 
     Returns the slave's target and the master's position by cycle, and what the resolvers are taken to show too much.
     """
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    for channel in channels:
-        channel.leap_limit = 20.0
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    stop, channels = make_stop(20.0)
     units = [channel.units for channel in channels]
     shown, told = [0, 0], []
     begin = [units[0].counts(0.0), units[1].counts(LAW.at(speed * 2 * CONFIG.cycle_s)[0])]
@@ -90,10 +94,7 @@ def test_a_leap_of_a_resolver_is_no_motion_of_the_master_and_moves_the_slaves_ta
 
 @pytest.mark.parametrize("is_told", [True, False])
 def test_a_way_gone_while_no_sync_was_sent_is_no_leap(is_told):
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
-    for channel in channels:
-        channel.leap_limit = 20.0
+    stop, channels = make_stop(20.0)
     stop.begin(0.0, math.tau, [0, 0])
     for cycle in [*range(10), *range(30, 60)]:
         for channel in channels:
@@ -107,10 +108,7 @@ def test_a_way_gone_while_no_sync_was_sent_is_no_leap(is_told):
 
 
 def test_a_way_gone_in_silence_is_no_leap():
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
-    for channel in channels:
-        channel.leap_limit = 20.0
+    stop, channels = make_stop(20.0)
     stop.begin(0.0, 0.0, [0, 0])
     for cycle in range(1, 60):
         for channel in channels:
@@ -123,10 +121,7 @@ def test_a_way_gone_in_silence_is_no_leap():
 
 @pytest.mark.parametrize(("back", "left"), [(250, 0), (0, -250)])
 def test_a_leap_that_goes_back_while_no_sync_was_sent_has_gone_back(back, left):
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
-    for channel in channels:
-        channel.leap_limit = 20.0
+    stop, channels = make_stop(20.0)
     stop.begin(0.0, math.tau, [0, 0])
     for cycle in [*range(10), *range(18, 60)]:
         for channel in channels:
@@ -145,8 +140,7 @@ def test_a_leap_that_goes_back_while_no_sync_was_sent_has_gone_back(back, left):
 def test_a_slave_that_the_gateways_loop_does_not_get_near_its_cam_is_left_to_its_drive(
     is_in_torque, away_deg, is_stopped, leapt
 ):
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    stop, channels = make_stop(40.0)
     slave = channels[1]
     slave.statusword = 0x1237
     slave.controlword = COMMAND_ENABLE_OPERATION
@@ -157,7 +151,6 @@ def test_a_slave_that_the_gateways_loop_does_not_get_near_its_cam_is_left_to_its
         axis = CONFIG.ordered_axes[1].model_copy(update={"position_loop": section})
         slave.position_loop = position_loop(axis, CONFIG.cycle_s)
     target = slave.units.counts(LAW.at(0.0)[0])
-    slave.leap_limit = 40.0
     slave.actual = target + round(away_deg / 360.0 * 4096)
     stop.begin(0.0, 0.0, [0, target])
     slave.actual += leapt
@@ -168,13 +161,12 @@ def test_a_slave_that_the_gateways_loop_does_not_get_near_its_cam_is_left_to_its
 
 def test_no_drive_is_told_to_stop_while_its_target_jumps():
     """Its stop begins with the speed of its targets: 250 counts within a millisecond are 384 rad/s."""
-    channels = [AxisChannel(name, 1, axis_units(axis), 100) for name, axis in CONFIG.axes.items()]
-    stop = CoupledStop(LAW, channels, Guard(CONFIG.guard, CONFIG.axis_names), CONFIG.cycle_s, 0.0)
+    stop, channels = make_stop(40.0)
     slave = channels[1]
     target = slave.units.counts(LAW.at(0.0)[0])
     for back_in in range(40, 60):
         for channel in channels:
-            channel.leap_limit, channel.leapt = 40.0, 0
+            channel.leapt = 0
             channel.statusword, channel.controlword = 0x1237, COMMAND_ENABLE_OPERATION
         channels[0].actual, slave.actual = 0, target
         stop.begin(0.0, 0.0, [0, target])

@@ -2,12 +2,14 @@
 
 import pytest
 
+from config.conversion import closure_at_home
 from config.loading import load_config
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.running.drive_settings import axis_units
 from gateway.running.load_check import MEAN_CYCLES, LoadCheck, build_load_check
 
 PAPER = load_config("paper")
+CLOSURE = closure_at_home(PAPER)
 FRICTION_NM = (0.04, 0.05)
 
 
@@ -63,8 +65,8 @@ def test_one_blow_of_a_controller_is_no_load_carried():
 
 def test_the_model_is_the_feed_forwards_and_none_without_it():
     without = PAPER.model_copy(update={"feed_forward": PAPER.feed_forward.model_copy(update={"enabled": False})})
-    assert build_load_check(without) is None
-    check, axes = build_load_check(PAPER), channels()
+    assert build_load_check(without, CLOSURE) is None
+    check, axes = build_load_check(PAPER, CLOSURE), channels()
     assert looked(check, axes, [(0, 0)] * 50) is None
     # At home link p lies level: 0.596 kg at 90.7 mm, and its share of q, r and the end effector, carry to the left.
     assert "what takes 413 by the model" in check.problems[0]
@@ -81,7 +83,7 @@ def test_friction_that_no_model_has_holds_a_small_load(load_Nm, is_one):
 @pytest.mark.parametrize(("cycle_us", "cycles"), [(1000, 50), (4000, 3 * MEAN_CYCLES), (20_000, 3 * MEAN_CYCLES)])
 def test_however_long_a_cycle_is_several_means_are_looked_at(cycle_us, cycles):
     bus = PAPER.bus.model_copy(update={"cycle_us": cycle_us})
-    check = build_load_check(PAPER.model_copy(update={"bus": bus}))
+    check = build_load_check(PAPER.model_copy(update={"bus": bus}), CLOSURE)
     check.begin(channels())
     looks = 0
     while not check.is_over:
@@ -92,4 +94,4 @@ def test_however_long_a_cycle_is_several_means_are_looked_at(cycle_us, cycles):
 
 def test_it_can_be_left_out():
     section = PAPER.feed_forward.model_copy(update={"load_check_ms": 0.0})
-    assert build_load_check(PAPER.model_copy(update={"feed_forward": section})) is None
+    assert build_load_check(PAPER.model_copy(update={"feed_forward": section}), CLOSURE) is None

@@ -5,6 +5,7 @@ import math
 import pytest
 import yaml
 from guarded_machine import CV, PAPER, SERVO, Guarded, StopReason, at_theta2
+from torque_loops import TORQUE_LOOPS
 
 from config.loading import parse_config
 from config.schema import GatewayConfig
@@ -12,17 +13,12 @@ from gateway.cyclic.guard import Condition
 from gateway.errors import CommissioningError
 from sim_drive.injection.faults import Direction, Fault, FaultKind
 
-LOOPS = {
-    "cv": {"proportional_Nm_per_rad": 20, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.3},
-    "servo": {"proportional_Nm_per_rad": 15, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.18},
-}
-
 
 def machine_in_torque() -> GatewayConfig:
     """The paper's machine with the gateway's own, softer, position loops."""
     document = yaml.safe_load(PAPER.text)
-    for name, gains in LOOPS.items():
-        document["axes"][name]["position_loop"] = {**gains, "torque_limit_Nm": 4.5}
+    for name, gains in TORQUE_LOOPS.items():
+        document["axes"][name]["position_loop"] = gains
     document["guard"]["frozen_actual"]["limit_deg"] = 0.9
     return parse_config(yaml.safe_dump(document), PAPER.path)
 

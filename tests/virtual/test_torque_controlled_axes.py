@@ -2,6 +2,7 @@
 
 import pytest
 import yaml
+from torque_loops import TORQUE_LOOPS
 
 from config.loading import load_config, parse_config
 from drivers.virtual_time import VirtualBus
@@ -16,17 +17,13 @@ from sim_drive.injection.injector import Injector
 
 PAPER = load_config("paper")
 CV, SERVO = 1, 2
-LOOPS = {
-    "cv": {"proportional_Nm_per_rad": 20, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.3},
-    "servo": {"proportional_Nm_per_rad": 15, "integrating_Nm_per_rad_s": 60, "derivative_Nms_per_rad": 0.18},
-}
 SAMPLE = SampleLayout(PAPER.axis_names)
 
 
 def machine_with(*axes, is_learning=False):
     document = yaml.safe_load(PAPER.text)
     for name in axes:
-        document["axes"][name]["position_loop"] = {**LOOPS[name], "torque_limit_Nm": 4.5}
+        document["axes"][name]["position_loop"] = TORQUE_LOOPS[name]
     if is_learning:
         document["learning"] = {"enabled": True}
         document["motion"]["speed_rpm"] = 30
