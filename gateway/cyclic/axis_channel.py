@@ -11,6 +11,9 @@ from gateway.units import AxisUnits
 LEAP_GAP_CYCLES: Final = 2
 """A leap is told over so many missed TPDOs; an axis that was told nothing for longer may have gone as far."""
 
+RARE_CYCLES: Final = 6
+"""Whose TPDO has been missing within so many cycles may miss SYNCs, and see the next ones as rarely."""
+
 
 class AxisChannel:
     """What the cycle sends to a drive, and what came back last."""
@@ -24,6 +27,7 @@ class AxisChannel:
         "name",
         "node_id",
         "position_loop",
+        "rare_cycles",
         "rpdo_cob_id",
         "silent_cycles",
         "statusword",
@@ -58,6 +62,8 @@ class AxisChannel:
         self.torque = 0
         self.silent_cycles = 0
         """Cycles in a row that have been without its TPDO."""
+        self.rare_cycles = 0
+        """As many as are left of ``RARE_CYCLES``."""
         self.leap_limit = math.inf
         """Counts in a cycle, beyond those expected, that no axis goes: its resolver has leapt."""
         self.leapt = 0

@@ -32,6 +32,10 @@ MAX_SKIPPED: Final = 1000
 """Cycles after which a master that nobody has seen stands, or is anywhere."""
 CALM_CYCLES: Final = 5
 """A target that jumps is sent, applied, reached, and, where SYNC is missing, overshot; so long no drive is to stop."""
+SPREAD_CYCLES: Final = 4
+"""Over so many a leap goes into the target of a drive that misses SYNCs. It goes on with a jump until the next one, by
+as much as the target has jumped: every other SYNC missing, it would swing about a single jump for as long as that
+lasts, and what it makes of the second half of two undoes what it has made of the first."""
 LED_RAD: Final = math.radians(10.0)
 """Farther from its target a slave whose position loop is closed here is not led by it: its own drive brakes better."""
 POSITION_GAIN: Final = 0.7
@@ -90,6 +94,43 @@ class _SeenAxis:
         return moved
 
 
+class _LeapInTarget:
+    """What an axis' resolver shows too much, as far as that is in the axis' target."""
+
+    __slots__ = ("_axis", "_goal", "_left", "calm_cycles", "counts")
+
+    def __init__(self, axis: AxisChannel) -> None:
+        self._axis = axis
+        self.begin()
+
+    def begin(self) -> None:
+        """Nothing of a leap has been sent yet."""
+        self._goal = 0
+        self._left = 0
+        """Cycles in which the goal is to be reached."""
+        self.counts = 0
+        self.calm_cycles = CALM_CYCLES
+        """Since the target has jumped: a drive's own stop begins with the speed of its targets."""
+
+    def step(self) -> None:
+        """One cycle: towards the leap that has been seen."""
+        axis = self._axis
+        if axis.leapt != self._goal:
+            self._goal = axis.leapt
+            self._left = SPREAD_CYCLES if axis.rare_cycles else 1
+        if self._left:
+            self.counts += round((self._goal - self.counts) / self._left)
+            self._left -= 1
+            self.calm_cycles = 0
+        else:
+            self.calm_cycles += 1
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether the drive has long had a target that has not jumped."""
+        return self.calm_cycles > CALM_CYCLES
+
+
 class CoupledStop:
     """A `gateway.cyclic.demand.Demand` for two axes, master first, that takes over from the one that was followed."""
 
@@ -117,9 +158,7 @@ class CoupledStop:
         """Where the master was seen last, rad."""
         self._rest_from = 0
         self._rest_cycles = 0
-        self._leapt = 0
-        """What the slave's resolver shows too much, as it is in its target, and for how many cycles it has been so."""
-        self._calm_cycles = 0
+        self._leap = _LeapInTarget(self._slave)
         self.targets = [0, 0]
         self.torque_offsets = [0, 0]
         self.velocities = [0.0, 0.0]
@@ -138,8 +177,7 @@ class CoupledStop:
         master, slave = self._master, self._slave
         self.targets = list(targets)
         self._slave_targets = [targets[SLAVE]] * len(self._slave_targets)
-        self._leapt = 0
-        self._calm_cycles = CALM_CYCLES
+        self._leap.begin()
         self._cycle = 0
         self._rest_cycles = 0
         self.is_finished = False
@@ -175,14 +213,12 @@ class CoupledStop:
             self._seen_slave.unseen_cycles += 1
         else:
             self._seen_slave.look()
-        self._note_jump(slave.leapt)
+        self._leap.step()
         if disabled >> MASTER & 1:
             master.controlword = COMMAND_DISABLE_VOLTAGE
         if disabled >> SLAVE & 1:
             slave.controlword = COMMAND_DISABLE_VOLTAGE
-        elif self._is_lost(slave) or (
-            self._calm_cycles > CALM_CYCLES and (self.is_finished or not self._is_led(slave))
-        ):
+        elif self._is_lost(slave) or (self._leap.is_calm and (self.is_finished or not self._is_led(slave))):
             slave.controlword = COMMAND_QUICK_STOP
         if self.is_finished:
             return
@@ -192,7 +228,7 @@ class CoupledStop:
         target = slave.units.counts(theta5) + self._turns + round(left * left * (3.0 - 2.0 * left) * self._offset)
         self._slave_targets = [*self._slave_targets[1:], target]
         # New lists: whoever keeps the last ones keeps that step's values.
-        self.targets = [self.targets[MASTER], wrap_counts(target + slave.leapt)]
+        self.targets = [self.targets[MASTER], wrap_counts(target + self._leap.counts)]
         self.velocities = [self.master_velocity, slope * self.master_velocity]
         self.is_finished = self._rest_cycles >= self._standstill_cycles
 
@@ -217,11 +253,6 @@ class CoupledStop:
     @staticmethod
     def _is_lost(axis: AxisChannel) -> bool:
         return axis.silent_cycles == 0 and axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED
-
-    def _note_jump(self, leapt: int) -> None:
-        """A leap makes the slave's target jump, and its drive's own stop begins with the speed of its targets."""
-        self._calm_cycles = self._calm_cycles + 1 if leapt == self._leapt else 0
-        self._leapt = leapt
 
     def _is_led(self, slave: AxisChannel) -> bool:
         if slave.position_loop is None or slave.silent_cycles:

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, AxisChannel
+from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, RARE_CYCLES, AxisChannel
 from gateway.cyclic.guard import Condition, Guard
 from gateway.record.sample import INT32_MAX, Phase
 from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
@@ -20,6 +20,8 @@ SETTLING_CYCLES: Final = 10
 """Cycles for which an axis may stand where its direction turns, or its friction holds it, before it is in motion."""
 PUSHED_CYCLES: Final = 80
 """An integrator pushes slowly, and an axis that nobody sees is the faster for it: for so long less is as bad."""
+DRIVING_SHARE: Final = 3
+"""So many times the torque that must not go unanswered is more than any load that an axis stands under."""
 MICROMETRES: Final = 1e6
 LEAP_SHARE: Final = 2.0
 """Of the velocity limit: an axis that is so much faster within a single cycle has not moved, its resolver has leapt."""
@@ -160,7 +162,10 @@ class CycleWatch:
         for number, watched in enumerate(self._watched):
             if awaited >> number & 1:
                 continue
-            watched.axis.silent_cycles = 0
+            axis = watched.axis
+            axis.silent_cycles = 0
+            if axis.rare_cycles:
+                axis.rare_cycles -= 1
             if not guard.is_quiet:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
@@ -213,6 +218,7 @@ class CycleWatch:
         for number, watched in enumerate(self._watched):
             if awaited >> number & 1:
                 watched.axis.silent_cycles += 1
+                watched.axis.rare_cycles = RARE_CYCLES
                 watched.is_fresh = False
                 if watched.axis.silent_cycles > LEAP_GAP_CYCLES:
                     watched.is_known = False
@@ -248,9 +254,19 @@ class CycleWatch:
             watched.still_cycles = 0
 
     def _check_follower(self, number: int, watched: _WatchedAxis, target: int, now_ns: int) -> None:
-        """A resolver that dies in a stop is as bad as in a run."""
-        moved = wrap_counts(watched.axis.actual - watched.actual)
-        self._check_answer(number, watched, target, moved, now_ns)
+        """A resolver that dies in a stop is as bad as in a run.
+
+        Torques have nothing to be compared with there, but what drives an axis towards a target far away moves it.
+        """
+        axis, guard = watched.axis, self._guard
+        moved = wrap_counts(axis.actual - watched.actual)
+        if self._check_answer(number, watched, target, moved, now_ns):
+            error, limit = wrap_counts(target - axis.actual), DRIVING_SHARE * watched.unanswered
+            torque = axis.torque if error > 0 else -axis.torque
+            if abs(error) > watched.frozen_counts and torque > limit:
+                guard.hold(Condition.UNANSWERED_TORQUE, number, axis.torque, limit, now_ns)
+            elif not guard.is_quiet:
+                guard.clear(Condition.UNANSWERED_TORQUE, number)
 
     def _check_drive(self, number: int, watched: _WatchedAxis, now_ns: int) -> None:
         guard, axis = self._guard, watched.axis
@@ -276,12 +292,11 @@ class CycleWatch:
             if not guard.is_quiet and watched.is_fresh:
                 guard.clear(Condition.VELOCITY, number)
             return
-        if watched.is_known:
-            axis.sees_leap(moved, wrap_counts(target - watched.target))
-        if not watched.is_fresh:
+        if not watched.is_known:
             return
+        axis.sees_leap(moved, wrap_counts(target - watched.target))
         bound = watched.velocity
-        if not -bound <= moved <= bound:
+        if watched.is_fresh and not -bound <= moved <= bound:
             guard.hold(Condition.VELOCITY, number, moved, int(bound), now_ns)
         elif 2.0 * abs(axis.leapt) > axis.leap_limit:
             guard.hold(Condition.VELOCITY, number, axis.leapt, int(bound), now_ns)

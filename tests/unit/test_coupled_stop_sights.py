@@ -7,7 +7,7 @@ import pytest
 from config.loading import load_config
 from config.schema import PositionLoopSection
 from drivers.cia402 import COMMAND_ENABLE_OPERATION, COMMAND_QUICK_STOP
-from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.axis_channel import RARE_CYCLES, AxisChannel
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.reactions import CoupledStop
 from gateway.running.drive_settings import axis_units, position_loop
@@ -181,3 +181,38 @@ def test_no_drive_is_told_to_stop_while_its_target_jumps():
                 break
         assert stopped_in is not None
         assert stopped_in > jumped_in + 4
+
+
+def overshoot(stop, channels, target, leapt, phase):
+    """How far a drive that sees every other SYNC gets from a target that jumps by ``leapt``, once it has had it.
+
+    At every SYNC that it sees it makes for its target within a cycle, and goes on so for the second one.
+    """
+    slave = channels[1]
+    demand, away = float(target), []
+    for cycle in range(60):
+        is_seen = cycle % 2 == phase
+        slave.silent_cycles = 0 if is_seen else 1
+        if is_seen:
+            slave.actual = target + (leapt if cycle >= 11 else 0)
+            demand = 2.0 * stop.targets[1] - demand
+        stop.step()
+        if cycle > 22:
+            away.append(abs(demand - target - leapt))
+    return max(away)
+
+
+@pytest.mark.parametrize("phase", [0, 1])
+@pytest.mark.parametrize("leapt", [250, -499])
+def test_a_drive_that_misses_every_other_sync_does_not_swing_about_its_target(leapt, phase):
+    outcomes = []
+    for rare_cycles in (RARE_CYCLES, 0):
+        stop, channels = make_stop(40.0)
+        slave = channels[1]
+        slave.statusword, slave.controlword = 0x1237, COMMAND_ENABLE_OPERATION
+        target = slave.units.counts(LAW.at(0.0)[0])
+        slave.actual, slave.rare_cycles = target, rare_cycles
+        stop.begin(0.0, 0.0, [0, target])
+        outcomes.append(overshoot(stop, channels, target, leapt, phase))
+    assert outcomes[0] <= 1.0
+    assert outcomes[1] == abs(leapt)

@@ -9,7 +9,7 @@ import pytest
 from config.guard_section import Reaction
 from config.loading import ConfigError, load_config, parse_config
 from drivers.virtual_time import VirtualBus
-from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.axis_channel import RARE_CYCLES, AxisChannel
 from gateway.cyclic.guard import REASON_OF, Condition, Guard, StopReason
 from gateway.cyclic.watch import NO_LIMITS, AxisLimits, CycleWatch
 from gateway.record.sample import Phase
@@ -324,6 +324,48 @@ def test_a_leap_that_stays_is_too_fast_and_a_glitch_that_goes_back_is_not():
         assert [axis.leapt for axis in axes] == [0, leapt]
         watch.begin()
         assert axes[1].leapt == 0
+
+
+def test_a_leap_is_too_fast_where_every_other_tpdo_is_missing():
+    for counts, is_tripped in ((110, True), (-150, True), (0, False)):
+        guard, axes, watch = make()
+        for cycle, (demand, actual) in enumerate(leap(counts=counts)):
+            if cycle % 2 == 0:
+                axes[1].actual = actual
+            check(watch, cycle, demand, awaited=cycle % 2 << 1)
+        assert [trip.condition for trip in guard.tripped] == [Condition.VELOCITY] * is_tripped
+        assert axes[1].leapt == counts
+
+
+def test_an_axis_whose_tpdo_has_been_missing_is_seen_rarely_for_a_while():
+    _, axes, watch = make()
+    check(watch, 0, awaited=0b10)
+    check(watch, 1, awaited=0b10)
+    for cycle in range(RARE_CYCLES):
+        assert [bool(axis.rare_cycles) for axis in axes] == [False, True]
+        check(watch, 2 + cycle)
+    assert axes[1].rare_cycles == 0
+
+
+def test_a_follower_that_is_driven_towards_a_far_target_and_stands_is_not_seen():
+    """Three times 250 per mille, towards a target more than 11 counts away, and not a count for eight cycles."""
+    for error, torque, moves, tripped in (
+        (12, 751, False, 8),
+        (-12, -751, False, 8),
+        (12, 750, False, None),
+        (11, 3000, False, None),
+        (12, -3000, False, None),
+        (12, 3000, True, None),
+    ):
+        guard, axes, watch = make()
+        told = None
+        for cycle in range(20):
+            axes[1].actual = cycle // 7 if moves else 0
+            axes[1].torque = torque
+            check(watch, cycle, axes[1].actual + error, is_enabled=False, followers=0b10)
+            told = cycle if guard.tripped and told is None else told
+        assert told == tripped
+        assert not tripped or guard.disabled == 0b10
 
 
 def test_a_demand_that_comes_back_or_dithers_is_no_dead_resolver():

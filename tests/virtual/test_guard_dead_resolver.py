@@ -62,6 +62,41 @@ def test_a_servo_resolver_that_dies_in_a_quick_stop_takes_its_torque(after_s):
 
 
 @pytest.mark.parametrize(
+    ("at_s", "after_s", "for_s"),
+    [(1.8382, 0.0477, 0.09), pytest.param(1.7257, 0.0407, 9.0, marks=pytest.mark.slow)],
+)
+def test_a_servo_resolver_that_dies_where_a_quick_stop_ends_takes_its_torque(at_s, after_s, for_s):
+    """The master stands already, and so does the demand; the servo axis is on its way to it."""
+    leap = Fault(FaultKind.JUMPING_RESOLVER, CV, at_s, 0.05, counts=200)
+    run = Guarded(leap, Fault(FaultKind.FROZEN_RESOLVER, SERVO, at_s + after_s, for_s)).to_end()
+    assert run.trips[-1].condition is Condition.UNANSWERED_TORQUE
+    strain = run.strain(at_s)
+    assert strain.least_sine > 0.79
+    assert math.degrees(strain.cam_distance_rad) < 20.0
+
+
+@pytest.mark.parametrize(
+    ("at_s", "swapped_s", "for_s", "counts"),
+    [
+        (1.546, 0.0679, 0.003, 500),
+        pytest.param(0.8446, 0.05, 0.03, -500, marks=pytest.mark.slow),
+        pytest.param(2.719, 0.1, 0.003, -500, marks=pytest.mark.slow),
+        pytest.param(2.753, 0.2971, 0.003, 250, marks=pytest.mark.slow),
+    ],
+)
+def test_a_leap_of_a_servo_whose_drive_sees_every_other_sync_does_not_make_it_swing(at_s, swapped_s, for_s, counts):
+    """Of two SYNCs swapped both come at once, every 2 ms."""
+    swapped = Fault(
+        FaultKind.REORDERED_FRAMES, SERVO, at_s - swapped_s, 0.43, cob_id=0x80, direction=Direction.RECEIVED
+    )
+    run = Guarded(swapped, Fault(FaultKind.JUMPING_RESOLVER, SERVO, at_s, for_s, counts=counts)).to_end()
+    assert not run.is_torn
+    strain = run.strain(at_s - swapped_s)
+    assert strain.least_sine > 0.79
+    assert math.degrees(strain.cam_distance_rad) < 30.0
+
+
+@pytest.mark.parametrize(
     ("node", "at_s", "counts"),
     # Enabling lasts from 0.131 to 0.148 s: the CV axis is held from 0.14 s on, the servo axis to its end.
     [(SERVO, 0.138, 150), (CV, 0.138, -400), (CV, 0.142, 150), (SERVO, 0.144, -150)],
