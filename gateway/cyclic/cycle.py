@@ -3,34 +3,23 @@
     SYNC(k) -> drives latch actual values, apply the demand received before SYNC(k), send TPDOs(k)
             -> the loop has all TPDOs(k), or their deadline passes -> guard -> demand -> RPDOs -> SYNC(k+1)
 
-A drive in cyclic synchronous position reaches the target that it applied at SYNC(k-1) at SYNC(k), where it also latches
-its actual position. So the following error of cycle k compares the target that was *sent* in cycle k-2 with the actual
-value latched at SYNC(k): both belong to the same instant.
+Here is when what is on the bus, and the account of it; guard and demand are `gateway.cyclic.steering`'s.
 """
 
 from collections.abc import Callable
 from operator import attrgetter
 from typing import Final
 
-from config.guard_section import Reaction
-from drivers.cia402 import COMMAND_DISABLE_VOLTAGE, COMMAND_QUICK_STOP
 from drivers.frame import Frame
 from drivers.nmt import SYNC_COB_ID
 from drivers.object_dictionary import DataType
 from drivers.pdo import PdoLayout
-from gateway.cyclic.axis_channel import AxisChannel
-from gateway.cyclic.demand import Demand
-from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.guard import Condition
 from gateway.cyclic.lateness import Late
-from gateway.cyclic.listeners import ErrorObserver, LateListener, SampleSink
-from gateway.cyclic.position_loop import PositionLoop
-from gateway.cyclic.reactions import CoupledStop
-from gateway.cyclic.watch import STATUSWORD_OPERATION_ENABLED, STATUSWORD_STATE_MASK, CycleWatch
+from gateway.cyclic.listeners import LateListener, SampleSink
+from gateway.cyclic.steering import Steering
 from gateway.record.lateness import LateKind
 from gateway.record.sample import INT32_MAX, MISSED_TPDO_MASK, Phase, SampleFlag, saturate_int32
-from gateway.units import HALF_RANGE, RANGE_MASK
-
-__all__ = ["RPDO_LAYOUT", "SYNC_FRAME", "TPDO_LAYOUT", "AxisChannel", "CyclicLoop"]
 
 RPDO_LAYOUT: Final = PdoLayout((DataType.UNSIGNED16, DataType.INTEGER32, DataType.INTEGER16))
 """Controlword, target position, torque offset."""
@@ -55,60 +44,38 @@ and its grid slips by what each of them is late."""
 _actual_of: Final = attrgetter("actual")
 _statusword_of: Final = attrgetter("statusword")
 _torque_of: Final = attrgetter("torque")
-_target_of: Final = attrgetter("target")
 _unpack_tpdo: Final = TPDO_LAYOUT.unpack_from
 _pack_rpdo: Final = RPDO_LAYOUT.pack
 _TPDO_LENGTH: Final = TPDO_LAYOUT.length
 _COMMISSIONING: Final = Phase.COMMISSIONING
-_CAM: Final = Phase.CAM
-
-
-_Sent = tuple[float, float, list[float], list[int], list[int], Phase]
-"""A demand: master position, master velocity, velocities, targets, torque offsets, phase. Its lists are not changed."""
 
 
 class CyclicLoop:
-    """The cyclic exchange with all axes.
-
-    Until ``follow`` is called the target of a drive without torque is its actual position, and it is held from the
-    moment the drive is enabled, so that the axis stays where it is. The host calls ``sent`` after it has handed a batch
-    of frames to the bus.
-    """
+    """The cyclic exchange with all axes. The host calls ``sent`` after it has handed a batch of frames to the bus."""
 
     __slots__ = (
         "_all_axes",
-        "_applied",
         "_arrival_ns",
         "_awaited",
-        "_coupled_stop",
+        "_axes",
         "_cpu_clock",
         "_cpu_ns",
         "_deadline_share_ns",
-        "_demand",
         "_doubtful",
         "_flags",
-        "_in_force",
+        "_guard",
         "_is_closed",
-        "_is_coupled_stop_due",
         "_is_lost",
         "_is_taken",
-        "_no_torque_offsets",
-        "_no_velocities",
-        "_observer",
         "_provisional",
-        "_sent",
         "_sent_ns",
         "_sink",
         "_sync_deviation_ns",
         "_sync_due_ns",
         "_sync_ns",
         "_wake_lateness_ns",
-        "_watch",
         "actuals_are_valid",
-        "axes",
         "cycle",
-        "guard",
-        "is_guarding_enabled",
         "is_off_bus",
         "is_paced",
         "is_running",
@@ -116,8 +83,8 @@ class CyclicLoop:
         "missing_syncs",
         "outbox",
         "period_ns",
-        "phase",
         "processor_read_ns",
+        "steering",
         "sync_gap_limit",
         "sync_period_ns",
         "tpdo_slots",
@@ -125,24 +92,20 @@ class CyclicLoop:
 
     def __init__(
         self,
-        axes: list[AxisChannel],
+        steering: Steering,
         period_ns: int,
-        guard: Guard,
         sink: SampleSink,
         cpu_clock: Callable[[], int] | None = None,
         tpdo_deadline_ns: int | None = None,
-        watch: CycleWatch | None = None,
-        coupled_stop: CoupledStop | None = None,
     ) -> None:
         """``cpu_clock`` gives the loop's processor time in ns, for the account; None leaves that figure at 0.
 
         ``tpdo_deadline_ns``: how long after SYNC the TPDOs are waited for; None is ``TPDO_DEADLINE`` of the period.
-        ``watch`` is what every cycle is compared with, ``coupled_stop`` how a machine whose axes depend on each other
-        makes a quick stop; without the latter every drive makes its own.
         """
-        self.axes = axes
+        self.steering = steering
+        self._axes = axes = steering.axes
+        self._guard = steering.guard
         self.period_ns = period_ns
-        self.guard = guard
         self.outbox: list[Frame] = []
         self.cycle = -1
         self.is_running = False
@@ -155,22 +118,14 @@ class CyclicLoop:
         self.actuals_are_valid = False
         """Every axis has sent a TPDO for the cycle that was closed last."""
         self.late_listener: LateListener | None = None
-        self.phase = Phase.COMMISSIONING
-        self.is_guarding_enabled = False
-        """Set while all drives are meant to be in Operation enabled."""
         self.sync_gap_limit = INT32_MAX
         """So many SYNCs in a row that were not sent are a condition of the guard's; so is a timer that sends none."""
         self.tpdo_slots = {axis.tpdo_cob_id: number for number, axis in enumerate(axes)}
-        self._watch = watch or CycleWatch(guard, axes)
-        self._coupled_stop = coupled_stop
-        self._is_coupled_stop_due = False
         self._sink = sink
         self._cpu_clock = cpu_clock
         self._cpu_ns = 0
         self.processor_read_ns = 0
         """What the clock of the loop's processor time showed when it was read last."""
-        self._demand: Demand | None = None
-        self._observer: ErrorObserver | None = None
         self._all_axes = (1 << len(axes)) - 1
         deadline_ns = round(period_ns * TPDO_DEADLINE) if tpdo_deadline_ns is None else tpdo_deadline_ns
         self._deadline_share_ns = period_ns - deadline_ns
@@ -193,13 +148,6 @@ class CyclicLoop:
         self._arrival_ns = 0
         self._sent_ns = 0
         self._flags = 0
-        self._no_velocities = [0.0] * len(axes)
-        self._no_torque_offsets = [0] * len(axes)
-        nothing = (0.0, 0.0, self._no_velocities, [0] * len(axes), self._no_torque_offsets, _COMMISSIONING)
-        self._in_force: _Sent = nothing
-        self._applied: _Sent = nothing
-        self._sent: _Sent = nothing
-        """Demands by age: reached at the last SYNC, applied at the last SYNC, sent last."""
 
     # -- commands ------------------------------------------------------------------------------------------------
 
@@ -228,54 +176,7 @@ class CyclicLoop:
     def rejoin_bus(self) -> None:
         """The own controller is back; the next SYNC is seen again, the next demand taken."""
         self.is_off_bus = False
-        self._watch.let_settle()
-
-    def follow(self, demand: Demand | None, observer: ErrorObserver | None = None) -> None:
-        """Take the targets from ``demand`` from the next cycle on; None: hold them at the actual positions.
-
-        ``observer`` is shown the following errors as long as the demand is followed.
-        """
-        self._demand = demand
-        self._observer = observer
-
-    def command(self, controlword: int) -> None:
-        """Send this controlword to every axis from the next RPDO on."""
-        for axis in self.axes:
-            axis.controlword = controlword
-
-    def begin_guarding(self) -> None:
-        """All drives are in Operation enabled, and are meant to stay in it."""
-        self.is_guarding_enabled = True
-        self._watch.begin()
-
-    def controlled_stop(self) -> None:
-        """Ramp the master down on the cam, if anything is in motion."""
-        if self._demand is not None:
-            self._demand.controlled_stop()
-
-    def quick_stop(self) -> None:
-        """Stop as fast as the drives can, and take the torque from the axes that the guard has disabled.
-
-        The demand is left behind; a machine in motion whose axes depend on each other makes a coupled stop. Does
-        nothing to drives that are being disabled.
-        """
-        if self.phase is Phase.DISABLED:
-            return
-        if self.phase is not Phase.QUICK_STOP:
-            self.is_guarding_enabled = False
-            is_on_cam = self._demand is not None and Phase.RAMP_UP <= self.phase <= Phase.CONTROLLED_STOP
-            is_coupled = is_on_cam and self._coupled_stop is not None
-            # It begins with the actual values of the cycle that is closed next.
-            self._is_coupled_stop_due = is_coupled
-            self.follow(None)
-            self.phase = Phase.QUICK_STOP
-            if not is_coupled:
-                self.command(COMMAND_QUICK_STOP)
-        disabled = self.guard.disabled
-        if disabled:
-            for number, axis in enumerate(self.axes):
-                if disabled >> number & 1:
-                    axis.controlword = COMMAND_DISABLE_VOLTAGE
+        self.steering.let_settle()
 
     # -- the cycle -----------------------------------------------------------------------------------------------
 
@@ -351,7 +252,7 @@ class CyclicLoop:
         """
         if len(data) != _TPDO_LENGTH:
             return False
-        axis = self.axes[number]
+        axis = self._axes[number]
         axis.statusword, axis.actual, axis.torque = _unpack_tpdo(data)
         bit = 1 << number
         if self._doubtful & bit and not self._is_own(bit, now_ns):
@@ -410,8 +311,8 @@ class CyclicLoop:
             self._send_sync(now_ns)
 
     def _lose_syncs(self, count: int, now_ns: int) -> None:
-        if count >= self.sync_gap_limit and self.phase is not _COMMISSIONING:
-            self.guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
+        if count >= self.sync_gap_limit and self.steering.phase is not _COMMISSIONING:
+            self._guard.hold(Condition.SYNC_LOST, 0, count, self.sync_gap_limit, now_ns)
 
     def _send_sync(self, now_ns: int) -> None:
         lateness_ns = now_ns - self._sync_due_ns
@@ -441,9 +342,7 @@ class CyclicLoop:
         self._sync_deviation_ns = deviation_ns
         self.sync_period_ns = span_ns = sync_ns - self._sync_ns
         if span_ns > self.period_ns + self.period_ns // SYNC_PATIENCE:
-            self._watch.forget()
-            if self._coupled_stop is not None:
-                self._coupled_stop.skip(span_ns // self.period_ns)
+            self.steering.skip(span_ns // self.period_ns)
         self._sync_ns = sync_ns
         self._arrival_ns = sync_ns
         self._sent_ns = 0
@@ -460,93 +359,12 @@ class CyclicLoop:
         self._doubtful = self._awaited
         self._flags |= self._awaited
         self.actuals_are_valid = not self._awaited
-        self._in_force = self._applied
-        if self._is_taken:
-            self._applied = self._sent
-        if self.phase is not _COMMISSIONING:
-            self._check(now_ns)
-        if self._observer is not None and not self._awaited:
-            self._show_errors(self._observer)
-        if self._is_coupled_stop_due and not (self.is_off_bus or self._is_lost):
-            self._begin_coupled_stop()
-        demand = self._demand
-        if demand is None:
-            for axis in self.axes:
-                # A drive that holds torque keeps its target: one that follows the actual position has no stiffness.
-                if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
-                    axis.target = axis.actual
-            nothing = self._no_torque_offsets
-            targets = list(map(_target_of, self.axes))
-            self._sent = (self._sent[0], 0.0, self._no_velocities, targets, nothing, self.phase)
-        elif self._is_taken:
-            # A demand that came too late is sent once more instead: two steps at once would be a jump.
-            demand.step()
-            self.phase = demand.phase
-            self._sent = (
-                demand.master_position,
-                demand.master_velocity,
-                demand.velocities,
-                demand.targets,
-                demand.torque_offsets,
-                demand.phase,
-            )
-        _, _, _, targets, torque_offsets, _ = self._sent
+        self.steering.step(self._awaited, self._is_taken, self.is_off_bus or self._is_lost, now_ns)
         self._is_lost = False
         outbox = self.outbox
-        for number, axis in enumerate(self.axes):
-            axis.target = targets[number]
-            torque = torque_offsets[number]
-            if axis.position_loop is not None:
-                torque = self._close_position_loop(number, axis, axis.position_loop, torque)
-            axis.torque_offset = torque
+        for axis in self._axes:
             payload = _pack_rpdo(axis.controlword, axis.target, axis.torque_offset)
             outbox.append(Frame(axis.rpdo_cob_id, payload))
-
-    def _close_position_loop(self, number: int, axis: AxisChannel, loop: PositionLoop, offset: int) -> int:
-        """Torque for an axis in cyclic synchronous torque: target and actual value are those of this SYNC."""
-        if axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED:
-            return loop.reset()
-        if self._awaited >> number & 1:
-            return loop.hold()
-        _, _, velocities, targets, _, _ = self._in_force
-        return loop.update(targets[number], axis.actual, velocities[number], offset)
-
-    def _check(self, now_ns: int) -> None:
-        if self.phase is Phase.DISABLED:
-            # Drives without torque call for no reaction; which of them is there is asked all the same.
-            self._watch.note_silence(self._awaited)
-            return
-        master_position, _, _, targets, torque_offsets, phase = self._in_force
-        stop = self._coupled_stop
-        followers = stop.followers if stop is not None and self._demand is stop and phase is Phase.QUICK_STOP else 0
-        self._watch.check(
-            self._awaited, targets, torque_offsets, master_position, phase, self.is_guarding_enabled, followers, now_ns
-        )
-        if self.guard.tripped:
-            self.react()
-
-    def _begin_coupled_stop(self) -> None:
-        self._is_coupled_stop_due = False
-        if self._coupled_stop is not None:
-            self._coupled_stop.begin(self._in_force[0], self._in_force[1], self._sent[3])
-            self._demand = self._coupled_stop
-
-    def _show_errors(self, observer: ErrorObserver) -> None:
-        position, velocity, _, targets, _, phase = self._in_force
-        errors = [
-            (target - axis.actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
-            for target, axis in zip(targets, self.axes, strict=True)
-        ]
-        is_steady = phase is _CAM and self.guard.is_quiet
-        observer.observe(position, velocity, errors, is_steady)
-
-    def react(self) -> None:
-        """Do what the guard calls for; the core also calls it for conditions that it notices outside the cycle."""
-        reaction = self.guard.reaction
-        if reaction is Reaction.QUICK_STOP or reaction is Reaction.DISABLE:
-            self.quick_stop()
-        elif reaction is Reaction.CONTROLLED_STOP:
-            self.controlled_stop()
 
     def _tell_late(self, kind: LateKind, sync_ns: int, deadline_ns: int, sent_ns: int | None) -> None:
         if self.late_listener is not None:
@@ -577,16 +395,16 @@ class CyclicLoop:
             self._flags |= SampleFlag.MISSED_RPDO_DEADLINE
             sent_ns = None if lead_ns == -_UNSENT_NS else self._sent_ns
             self._tell_late(LateKind.RPDO_DEADLINE, self._sync_ns, deadline_ns, sent_ns)
-            self.guard.hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
-        elif not self.guard.is_quiet:
-            self.guard.clear(Condition.MISSED_DEADLINE, 0)
+            self._guard.hold_cycles(Condition.MISSED_DEADLINE, 0, self._sync_ns)
+        elif not self._guard.is_quiet:
+            self._guard.clear(Condition.MISSED_DEADLINE, 0)
         arrival_ns = self._arrival_ns - self._sync_ns
         deviation_ns, period_ns, cpu_ns = self._sync_deviation_ns, self.sync_period_ns, self._cpu_ns
         spans_ns = (deviation_ns, period_ns, self._wake_lateness_ns, arrival_ns, lead_ns, cpu_ns)
         if max(spans_ns) > INT32_MAX or min(spans_ns) < -INT32_MAX:
             spans_ns = map(saturate_int32, spans_ns)
-        master_position, master_velocity, velocities, targets, torque_offsets, phase = self._in_force
-        axes = self.axes
+        master_position, master_velocity, velocities, targets, torque_offsets, phase = self.steering.in_force
+        axes = self._axes
         self._sink.append(
             self.cycle,
             self._sync_ns,

@@ -14,6 +14,7 @@ from gateway.cyclic.guard import Guard
 from gateway.cyclic.listeners import SampleSink
 from gateway.cyclic.operation import Operation
 from gateway.cyclic.reactions import CoupledStop
+from gateway.cyclic.steering import Steering
 from gateway.cyclic.torque_offsets import build_torque_offsets
 from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
 from gateway.learning.law import Learning, build_learning
@@ -124,9 +125,8 @@ def build_core(
         config.ordered_axes[0].limits.acceleration_rad_per_s2 if deceleration is None else deceleration,
     )
     deadline_ns = round((config.tpdo_deadline_us if tpdo_deadline_us is None else tpdo_deadline_us) * NS_PER_US)
-    loop = CyclicLoop(
-        channels, config.bus.cycle_us * NS_PER_US, guard, sink, cpu_clock, deadline_ns, watch, coupled_stop
-    )
+    steering = Steering(channels, guard, watch, coupled_stop)
+    loop = CyclicLoop(steering, config.bus.cycle_us * NS_PER_US, sink, cpu_clock, deadline_ns)
     loop.sync_gap_limit = config.guard.sync_lost.limit_cycles
     units = (channels[0].units, channels[1].units)
     if learning is None and config.learning.enabled:

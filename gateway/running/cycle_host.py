@@ -115,7 +115,7 @@ class CycleHost:
         None: nobody does.
         """
         self._echo_cob_id = echo_cob_id
-        self._demands = frozenset(axis.rpdo_cob_id for axis in core.loop.axes)
+        self._demands = frozenset(axis.rpdo_cob_id for axis in core.loop.steering.axes)
         self._core = core
         self._cyclic = cyclic
         self._service = service

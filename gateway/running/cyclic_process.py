@@ -129,7 +129,7 @@ def stop_drives(core: GatewayCore, port: Port) -> None:
 
     If even this does not reach them, they miss our heartbeat and their set-points, and stop by themselves.
     """
-    for axis in core.loop.axes:
+    for axis in core.loop.steering.axes:
         port.send(Frame(axis.rpdo_cob_id, RPDO_LAYOUT.pack(COMMAND_QUICK_STOP, axis.target, 0)))
     port.send(SYNC_FRAME)
 

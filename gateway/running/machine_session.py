@@ -230,8 +230,8 @@ class MachineSession:
         problems = problems or self._moved_apart(held, [axis.channel.actual for axis in self.axes])
         if problems:
             raise CommissioningError(problems)
-        self.loop.begin_guarding()
-        self.loop.phase = Phase.STANDSTILL
+        self.loop.steering.begin_guarding()
+        self.loop.steering.phase = Phase.STANDSTILL
 
     def _away_from_start(self, positions: Sequence[int], what: str) -> list[str]:
         """What is wrong with ``positions`` (counts) as a place to begin the plan from: a sentence an axis."""
@@ -276,11 +276,11 @@ class MachineSession:
         if self.may_move():
             self._step("moving")
             demand.begin(self.plan, [axis.channel.target for axis in self.axes])
-            loop.follow(demand, demand.observer)
+            loop.steering.follow(demand, demand.observer)
             self.is_following = True
             yield from self._until_finished(demand)
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self.is_stop_requested else StopReason.COMPLETED)
-        if loop.phase is not Phase.QUICK_STOP:
+        if loop.steering.phase is not Phase.QUICK_STOP:
             yield from self.master.pause(SETTLE_S)
             # Guarded until the end; but a wish to stop that comes now finds the run completed.
             reason = guard.stopped_by
@@ -288,15 +288,15 @@ class MachineSession:
                 self.stopped_by = reason
         if self.stopped_by is StopReason.COMPLETED and not demand.law.is_plain:
             self._step("the slave ends off its cam: give the next run --from-here")
-        if loop.phase is Phase.QUICK_STOP:
+        if loop.steering.phase is Phase.QUICK_STOP:
             self._step("quick stop")
 
     def _until_finished(self, demand: CamDemand | ApproachDemand) -> Procedure[None]:
         """Let the cycle follow its demand until that, or a stop that leaves it, is over."""
         loop = self.loop
-        while not (demand.is_finished or loop.phase is Phase.QUICK_STOP or self.bus.is_given_up):
+        while not (demand.is_finished or loop.steering.phase is Phase.QUICK_STOP or self.bus.is_given_up):
             if self.is_stop_requested:
-                loop.controlled_stop()
+                loop.steering.controlled_stop()
             yield self.master.now_ns + NS_PER_S
 
     def may_move(self) -> bool:
@@ -315,7 +315,7 @@ class MachineSession:
         self._step("approaching the cam")
         demand = approach.demand
         demand.begin(self._way, [axis.channel.target for axis in self.axes])
-        self.loop.follow(demand)
+        self.loop.steering.follow(demand)
         yield from self._until_finished(demand)
         if self.may_move():
             yield from self.master.pause(SETTLE_S)
@@ -336,15 +336,15 @@ class MachineSession:
     def _shut_down(self) -> Procedure[None]:
         """Disable every drive, by RPDO while the cycle runs, and take the nodes out of NMT operational."""
         loop = self.loop
-        loop.is_guarding_enabled = False
+        loop.steering.is_guarding_enabled = False
         disabled = True
         if loop.is_running:
             self._step("disabling the axes")
-            if loop.phase is Phase.QUICK_STOP:
+            if loop.steering.phase is Phase.QUICK_STOP:
                 yield from self._stands()
-            loop.command(cia402.COMMAND_DISABLE_VOLTAGE)
-            loop.follow(None)
-            loop.phase = Phase.DISABLED
+            loop.steering.command(cia402.COMMAND_DISABLE_VOLTAGE)
+            loop.steering.follow(None)
+            loop.steering.phase = Phase.DISABLED
             off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 
             def is_off() -> bool:

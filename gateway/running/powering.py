@@ -11,7 +11,8 @@ from drivers.cia402 import Controlword, ModeOfOperation, State, Statusword, stat
 from drivers.errors import NoAnswerError
 from drivers.master import Master, Procedure
 from drivers.object_dictionary import DataType
-from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.cycle import CyclicLoop
 from gateway.errors import CommissioningError
 from gateway.running.commissioning import NodeSettings
 

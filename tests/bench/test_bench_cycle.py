@@ -75,11 +75,11 @@ def calls() -> tuple[list[Call], int]:
     witness = Witness(new_core())
     bus = VirtualBus([witness, build_machine(CONFIG)], CONFIG.bus.bit_rate)
     loop = witness.core.loop
-    bus.run_while(lambda: loop.phase is not Phase.CAM, 1 << 62)
+    bus.run_while(lambda: loop.steering.phase is not Phase.CAM, 1 << 62)
     start = len(witness.calls)
     first = loop.cycle
     bus.run_while(lambda: loop.cycle < first + CYCLES, 1 << 62)
-    assert loop.phase is Phase.CAM
+    assert loop.steering.phase is Phase.CAM
     return witness.calls, start
 
 

@@ -18,8 +18,10 @@ from test_bench_cycle import CONFIG, NODE_IDS, Call, PackingSink, calls, new_cor
 
 from drivers.frame import Frame
 from drivers.socketcan_port import CAN_FRAME, SocketcanPort
-from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.guard import Guard
+from gateway.cyclic.steering import Steering
 from gateway.record.sample import MAX_AXES, Phase, SampleLayout
 from gateway.units import AxisUnits
 
@@ -157,7 +159,7 @@ def gateway_round(told: list[Call], start: int) -> Figures:
         listen()
 
     figures = measure(cycle, responder)
-    assert loop.phase is Phase.CAM
+    assert loop.steering.phase is Phase.CAM
     responder.close()
     return figures
 
@@ -262,8 +264,8 @@ def axes_round(axes: int, cycles: int = 1000) -> float:
     if isinstance(sink, PackingSink):
         sink.layout = SampleLayout(names)
         sink.buffer = bytearray(sink.layout.size)
-    loop = CyclicLoop(channels, 1_000_000, Guard(CONFIG.guard, names), sink)
-    loop.follow(Still(axes))  # pyright: ignore[reportArgumentType]
+    loop = CyclicLoop(Steering(channels, Guard(CONFIG.guard, names)), 1_000_000, sink)
+    loop.steering.follow(Still(axes))  # pyright: ignore[reportArgumentType]
     loop.start(0)
     answers = [[CAN_FRAME.pack(0x181 + n, 8, TPDO.pack(0x1637, k, 0)) for n in range(axes)] for k in range(cycles)]
     responder = Responder(answers, udp_pair)

@@ -327,15 +327,15 @@ class Conductor:
             if isinstance(event, StepReached) and event.step in MOMENT_OF_STEP:
                 self._reach(MOMENT_OF_STEP[event.step])
         self.seen_events = len(session.events)
-        phase = core.loop.phase
+        phase = core.loop.steering.phase
         moment = MOMENT_OF_PHASE.get(phase)
         if moment is not None and moment is not self.moment and self.moment is not Moment.RECOVERY:
             self._reach(moment)
         if phase is Phase.CAM:
-            degrees = math.degrees(core.loop._demand.master_position) % 360.0  # type: ignore[union-attr]
+            degrees = math.degrees(core.loop.steering._demand.master_position) % 360.0  # type: ignore[union-attr]
             if RETURN_STROKE_DEG[0] < degrees < RETURN_STROKE_DEG[1]:
                 self._arm(Moment.RETURN_STROKE)
-        law, demand = core._operation._demand.law, core.loop._demand  # type: ignore[union-attr]
+        law, demand = core._operation._demand.law, core.loop.steering._demand  # type: ignore[union-attr]
         if not law.is_plain and demand is not None and Phase.RAMP_UP <= phase <= Phase.QUICK_STOP:
             session.is_law_plain = False
             # The law counts whole turns as the demand does.

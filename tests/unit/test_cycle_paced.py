@@ -9,8 +9,10 @@ from hypothesis import strategies as st
 
 from config.schema import GuardSection
 from drivers.nmt import SYNC_COB_ID
-from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.guard import Condition, Guard
+from gateway.cyclic.steering import Steering
 from gateway.cyclic.watch import AxisLimits, CycleWatch
 from gateway.record.sample import INT32_MAX, Phase, SampleFlag
 from gateway.units import AxisUnits
@@ -57,10 +59,10 @@ class Bench:
         self.sink = ListSink()
         guard = Guard(GuardSection(), ("cv", "servo"))
         axes = [AxisChannel(n, i, units, 10**6) for i, n in ((1, "cv"), (2, "servo"))]
-        self.loop = CyclicLoop(axes, MS, guard, self.sink, watch=CycleWatch(guard, axes, limits))
+        self.loop = CyclicLoop(Steering(axes, guard, CycleWatch(guard, axes, limits)), MS, self.sink)
         self.loop.is_paced = is_paced
         self.demand = Counting()
-        self.loop.follow(self.demand)
+        self.loop.steering.follow(self.demand)
         self.loop.start(0)
 
     def tpdo(self, number, at_ns, actual=0):
@@ -153,7 +155,7 @@ def test_a_missing_sync_is_flagged_and_after_three_the_loop_sends_it_itself():
     assert bench.loop.next_wake_ns() == wakes[-1] + DEADLINE
     bench.tpdo(0, wakes[-1] + 1000)
     bench.tpdo(1, wakes[-1] + 2000)
-    assert bench.loop.phase is Phase.QUICK_STOP, "the guard takes it for a lost SYNC"
+    assert bench.loop.steering.phase is Phase.QUICK_STOP, "the guard takes it for a lost SYNC"
     assert bench.take() == [(0x201, 1), (0x202, -1)]
     bench.loop.wake(wakes[-1] + MS)
     assert [row["flags"] for row in bench.sink.rows] == [SampleFlag.SYNC_LOST, SampleFlag.SYNC_LOST]
@@ -188,8 +190,8 @@ def test_a_way_gone_while_a_sync_was_missing_is_no_leap(gap_ns):
     """39 counts in a cycle of 5.3 ms are none, whoever noticed the gap first; in one of 1 ms they are."""
     limits = AxisLimits(12.0, INT32_MAX, INT32_MAX, INT32_MAX, INT32_MAX)
     bench = Bench(limits=(limits, limits))
-    bench.loop.phase = Phase.CAM
-    bench.loop.begin_guarding()
+    bench.loop.steering.phase = Phase.CAM
+    bench.loop.steering.begin_guarding()
     for k in range(10):
         bench.cycle(k * MS, 4 * k)
     again_ns = 9 * MS + (gap_ns or MS)
@@ -199,7 +201,7 @@ def test_a_way_gone_while_a_sync_was_missing_is_no_leap(gap_ns):
         assert bench.loop.missing_syncs == 1
     for k in range(10):
         bench.cycle(again_ns + k * MS, 36 + 39 + 4 * k)
-    trips = {(trip.condition, trip.value) for trip in bench.loop.guard.tripped}
+    trips = {(trip.condition, trip.value) for trip in bench.loop.steering.guard.tripped}
     assert trips == (set() if gap_ns else {(Condition.VELOCITY, 38), (Condition.VELOCITY, 40)})
 
 
@@ -277,7 +279,7 @@ def test_whatever_comes_late_what_the_drives_apply_advances_by_one_step_at_most(
     sync_ns = now_ns = 0
     for late_ns, delay_ns, answers in events:
         sync_ns += MS + late_ns
-        if loop.phase is Phase.QUICK_STOP:
+        if loop.steering.phase is Phase.QUICK_STOP:
             # An axis has been silent for so long that the demand is left.
             break
         applied.append(next(demand for at_ns, demand in reversed(rpdos) if at_ns <= sync_ns))

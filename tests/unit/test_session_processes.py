@@ -129,7 +129,7 @@ class LateCore:
 
     def __init__(self, wakes):
         self.left = wakes
-        self.loop = self
+        self.loop = self.steering = self
 
     @property
     def is_done(self):

@@ -137,7 +137,7 @@ class Guarded:
     def place(self) -> tuple[str, Phase]:
         """Where the session is now: its step, and what the cycle demands."""
         steps = [event.step for event in self.events if isinstance(event, StepReached)]
-        return steps[-1] if steps else "", self.core.loop.phase
+        return steps[-1] if steps else "", self.core.loop.steering.phase
 
     @property
     def is_without_torque(self) -> bool:

@@ -84,7 +84,7 @@ def test_a_stop_on_the_way_is_one_and_a_place_without_a_way_is_refused():
     turns = round(math.degrees(first.machine.plant.angle(0)) / 360.0) * 360.0
     again = Again(first, 90.0 + turns, 80.0)
     again.bus.run_until(again.bus.now_ns + SECOND)
-    assert again.core.loop.phase is Phase.APPROACH
+    assert again.core.loop.steering.phase is Phase.APPROACH
     again.core.request_stop()
     again.bus.refresh()
     again.to_end()

@@ -10,9 +10,11 @@ from config.loading import load_config
 from drivers.object_dictionary import DataType
 from drivers.pdo import MappingEntry
 from drivers.virtual_time import VirtualBus
-from gateway.cyclic.cycle import AxisChannel, CyclicLoop
+from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.guard import Guard, StopReason
+from gateway.cyclic.steering import Steering
 from gateway.errors import GatewayError
 from gateway.record.sample import Phase, SampleLayout
 from gateway.running.commissioning import map_pdo
@@ -120,7 +122,7 @@ def test_the_drive_runs_the_downloaded_cam_against_the_actual_position_of_the_cv
     ]
     setups = [AxisSetup(node, channel, 37) for node, channel in zip(node_settings(PAPER), channels, strict=True)]
     guard = Guard(PAPER.guard, PAPER.axis_names)
-    loop = CyclicLoop(channels, 1_000_000, guard, Sink())
+    loop = CyclicLoop(Steering(channels, guard), 1_000_000, Sink())
     demand = CamDemand(prepared.cam.profile, (channels[0].units, channels[1].units), 0.001, 6.0, 30.0)
     master = build_master(PAPER)
     session = CammingSession(setups, network_settings(PAPER), master, loop, demand, prepared.plan, guard)

@@ -85,7 +85,7 @@ class Outage:
             assert set(told) == {"cv", "servo"}
             assert all(event.is_ready for event in told.values())
             assert not {State.OPERATION_ENABLED, State.FAULT} & {
-                state_of(axis.statusword) for axis in run.core.loop.axes
+                state_of(axis.statusword) for axis in run.core.loop.steering.axes
             }
         else:
             assert Phase.CAM not in run.phases

@@ -99,7 +99,7 @@ class Session:
         return [event for event in self.events if isinstance(event, GuardTripped)]
 
     def states(self):
-        return [state_of(axis.statusword) for axis in self.core.loop.axes]
+        return [state_of(axis.statusword) for axis in self.core.loop.steering.axes]
 
     def assert_safe(self):
         """No drive has torque, nothing moves, the linkage is whole, and all of it stays so."""

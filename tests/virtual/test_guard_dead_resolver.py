@@ -182,7 +182,7 @@ def test_a_small_leap_in_a_quick_stop_is_not_the_measure_of_what_comes_after_it(
         run.to_end()
     assert not run.is_torn
     assert math.degrees(run.strain(at_s).cam_distance_rad) < 12.0
-    assert max(abs(axis.leapt) for axis in run.core.loop.axes) < 60
+    assert max(abs(axis.leapt) for axis in run.core.loop.steering.axes) < 60
 
 
 def tpdo_lost(node, at_s):
@@ -205,7 +205,7 @@ def test_a_glitch_beside_a_lost_tpdo_stops_nothing(node, counts, lost):
     run = Guarded(glitch, tpdo_lost(node, at_s + (0.0029 if lost == "way back" else -0.0001))).to_end()
     assert run.stopped_by is StopReason.COMPLETED
     assert math.degrees(run.strain(at_s).cam_distance_rad) < 3.0
-    assert [axis.leapt for axis in run.core.loop.axes] == [0, 0]
+    assert [axis.leapt for axis in run.core.loop.steering.axes] == [0, 0]
 
 
 @pytest.mark.parametrize("lost", ["way out", "way back"])

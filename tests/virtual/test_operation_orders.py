@@ -54,11 +54,11 @@ def test_override_pause_and_jog_are_smooth_and_the_run_ends_at_home():
     run = Operated(cycles=1)
     run.order(1.9, Order.OVERRIDE, 40.0).order(2.6, Order.OVERRIDE, 0.0)
     run.order(2.7, Order.JOG, 101.0).until(4.2)
-    assert run.core.loop.phase is Phase.STANDSTILL
-    stood_at = run.core.loop.axes[0].actual
+    assert run.core.loop.steering.phase is Phase.STANDSTILL
+    stood_at = run.core.loop.steering.axes[0].actual
     run.order(4.2, Order.JOG, -6.0).order(5.2, Order.JOG, 0.0).until(6.0)
     # Back at 6 rpm for a second, less the ramps: about a tenth of a revolution.
-    assert 300 < stood_at - run.core.loop.axes[0].actual < 420
+    assert 300 < stood_at - run.core.loop.steering.axes[0].actual < 420
     run.order(6.0, Order.OVERRIDE, 100.0)
     run.to_end()
     assert [refusal[:20] for refusal in run.refusals] == ["", "", "a jog at 101 rpm is ", "", "", ""]
@@ -133,7 +133,7 @@ def test_a_phase_shift_moves_the_slave_along_its_cam_and_back():
     assert theta5 - run.prepared.cam.profile.at(theta2)[0] > math.radians(1.0)
     run.order(at_theta2(140) + 1.0, Order.PHASE_SHIFT, 0.0).to_end()
     assert run.refusals == ["", ""]
-    assert run.core.loop._demand is None
+    assert run.core.loop.steering._demand is None
     assert_whole_and_home(run)
     assert run.trips == []
 
@@ -177,7 +177,7 @@ def test_what_would_break_something_is_refused_and_changes_nothing(order, value,
     run = Operated(cycles=1).order(at_theta2(10), order, value)
     run.until(at_theta2(60))
     assert sentence in run.refusals[0]
-    assert run.core.loop._demand.law.is_plain
+    assert run.core.loop.steering._demand.law.is_plain
 
 
 def test_before_the_motion_every_order_is_refused():

@@ -53,7 +53,7 @@ def test_a_fault_is_reset_by_one_edge_and_the_run_may_begin_anew_from_there():
     assert told["cv"].text == "ready for a new run"
     assert [resets_of(frames, node) for node in (CV, SERVO)] == [0, 1]
     assert [restarts_of(frames, node) for node in (CV, SERVO)] == [0, 0]
-    assert [state_of(axis.statusword) for axis in run.core.loop.axes] == [State.SWITCH_ON_DISABLED] * 2
+    assert [state_of(axis.statusword) for axis in run.core.loop.steering.axes] == [State.SWITCH_ON_DISABLED] * 2
     # What happens while the axes are recovered is told once, and in its order.
     steps = [event.step for event in run.events if isinstance(event, StepReached)]
     assert steps[-3:] == ["disabling the axes", "recovering the axes", "done"]
@@ -68,7 +68,7 @@ def test_a_cause_that_goes_on_keeps_its_fault():
     assert not outcomes(run)["cv"].is_ready
     assert "has a fault that cannot be reset (last EMCY FF30h)" in outcomes(run)["cv"].text
     assert resets_of(frames, CV) == 1
-    assert state_of(run.core.loop.axes[0].statusword) is State.FAULT
+    assert state_of(run.core.loop.steering.axes[0].statusword) is State.FAULT
     assert_at_rest(run)
 
 
