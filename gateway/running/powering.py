@@ -25,7 +25,7 @@ MODE_TIMEOUT_S: Final = 1.0
 MODE_POLL_S: Final = 0.002
 DISABLE_TIMEOUT_S: Final = 0.5
 
-_FAULTY: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
+FAULTY: Final = (State.FAULT, State.FAULT_REACTION_ACTIVE)
 _WITHOUT_TORQUE: Final = (State.READY_TO_SWITCH_ON, State.SWITCH_ON_DISABLED)
 
 
@@ -54,12 +54,12 @@ class AxisPower:
     def reset_fault(self, axis: AxisSetup) -> Procedure[None]:
         """Reset, once and with a real edge, a fault that is there from before the session."""
         channel = axis.channel
-        if state_of(channel.statusword) not in _FAULTY:
+        if state_of(channel.statusword) not in FAULTY:
             return
         channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
         yield from self.cycles(START_CYCLES)
         channel.controlword = cia402.COMMAND_FAULT_RESET
-        reset = yield from self._master.wait_for(lambda: state_of(channel.statusword) not in _FAULTY, DISABLE_TIMEOUT_S)
+        reset = yield from self._master.wait_for(lambda: state_of(channel.statusword) not in FAULTY, DISABLE_TIMEOUT_S)
         channel.controlword = cia402.COMMAND_DISABLE_VOLTAGE
         if not reset:
             raise CommissioningError([f"node {axis.node.node_id} has a fault that cannot be reset{self._cause(axis)}"])
@@ -115,7 +115,7 @@ class AxisPower:
         node_id, channel = axis.node.node_id, axis.channel
         deadline_ns = self._master.now_ns + round(ENABLE_TIMEOUT_S * NS_PER_S)
         while (state := state_of(channel.statusword)) is not State.OPERATION_ENABLED:
-            if state in _FAULTY:
+            if state in FAULTY:
                 raise CommissioningError([f"node {node_id} went into a fault while being enabled{self._cause(axis)}"])
             if self._master.now_ns >= deadline_ns:
                 stays = f"it stays in '{state.value}'" if self._loop.actuals_are_valid else "its TPDOs have stopped"

@@ -7,16 +7,18 @@ one whose cause goes on stays. An axis that has lost its reference is not homed 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from drivers.cia402 import State, state_of
+from drivers.cia402 import state_of
 from drivers.errors import NodeError
 from drivers.master import Master, Procedure
 from drivers.nmt import NmtState
 from drivers.node import Event
 from gateway.errors import CommissioningError
 from gateway.running.commissioning import NetworkSettings, commission, start_nodes
-from gateway.running.powering import AxisPower, AxisSetup
+from gateway.running.powering import FAULTY, AxisPower, AxisSetup
 
 TPDO_TIMEOUT_S = 0.2
+ATTEMPTS = 2
+"""A node may go away once more while it is recovered; one that does so again is not to be relied on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,22 +66,26 @@ class Recovery:
     def _told(self, axis: AxisSetup, is_ready: bool, is_anew: bool, text: str) -> AxisRecovered:
         return AxisRecovered(self._master.now_ns, axis.node.name, is_ready, is_anew, text)
 
-    def _was_lost(self, axis: AxisSetup) -> bool:
+    def _is_away(self, axis: AxisSetup) -> bool:
+        """Silent, or back again from somewhere, since it was commissioned."""
         node = self._master.nodes[axis.node.node_id]
-        return (
-            axis.channel.silent_cycles > 0
-            or node.is_lost
-            or node.state is not NmtState.OPERATIONAL
-            or node.boot_ups != self._boot_ups[axis.node.node_id]
-        )
+        return axis.channel.silent_cycles > 0 or node.is_lost or node.boot_ups != self._boot_ups[axis.node.node_id]
 
     def _recover(self, axis: AxisSetup) -> Procedure[AxisRecovered]:
-        is_anew = self._was_lost(axis)
-        if is_anew:
-            yield from self._bring_back(axis)
-        had_fault = state_of(axis.channel.statusword) in {State.FAULT, State.FAULT_REACTION_ACTIVE}
-        yield from self._power.reset_fault(axis)
-        is_homed = axis.homing_method is None or (yield from self._power.is_homed(axis))
+        is_anew = had_fault = is_homed = False
+        is_away = self._is_away(axis) or self._master.nodes[axis.node.node_id].state is not NmtState.OPERATIONAL
+        for _ in range(ATTEMPTS):
+            if is_away:
+                is_anew = True
+                yield from self._bring_back(axis)
+            had_fault = had_fault or state_of(axis.channel.statusword) in FAULTY
+            yield from self._power.reset_fault(axis)
+            is_homed = axis.homing_method is None or (yield from self._power.is_homed(axis))
+            is_away = self._is_away(axis)
+            if not is_away:
+                break
+        else:
+            raise CommissioningError([f"node {axis.node.node_id} has been lost again while it was recovered"])
         done = ["commissioned anew"] if is_anew else []
         done += ["fault reset"] if had_fault else []
         done += ["ready for a new run" if is_homed else "its reference is lost: bring the linkage to its home position"]
