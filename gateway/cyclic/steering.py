@@ -99,6 +99,10 @@ class Steering:
         self.is_guarding_enabled = True
         self._watch.begin()
 
+    def trust_loads(self) -> None:
+        """Every axis has been seen to carry its load."""
+        self._watch.trust_loads()
+
     def controlled_stop(self) -> None:
         """Ramp the master down on the cam, if anything is in motion."""
         if self._demand is not None:

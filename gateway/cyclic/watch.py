@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gateway.cyclic.axis_channel import LEAP_GAP_CYCLES, RARE_CYCLES, AxisChannel
+from gateway.cyclic.free_motion import FreeMotion
 from gateway.cyclic.guard import Condition, Guard
 from gateway.record.sample import INT32_MAX, Phase
 from gateway.units import HALF_RANGE, RANGE_MASK, wrap_counts
@@ -28,6 +29,7 @@ LEAP_SHARE: Final = 2.0
 LEAST_LEAP_COUNTS: Final = 20.0
 """What a coarse resolver's noise shows is no leap."""
 
+_STANDSTILL: Final = Phase.STANDSTILL
 _RAMP_UP: Final = Phase.RAMP_UP
 _CONTROLLED_STOP: Final = Phase.CONTROLLED_STOP
 
@@ -73,6 +75,8 @@ class _WatchedAxis:
     __slots__ = (
         "actual",
         "axis",
+        "driven_counts",
+        "driven_way",
         "error",
         "frozen_counts",
         "is_fresh",
@@ -110,6 +114,9 @@ class _WatchedAxis:
         """Torque actual value and torque offset then."""
         self.pushed_cycles = 0
         """Cycles in a row with a torque that is too much if it lasts."""
+        self.driven_way = 0.0
+        """Counts a cycle that it would have by its torque, and how far that would have taken it, while it stands."""
+        self.driven_counts = 0.0
         self.is_fresh = False
         """The actual value of the cycle before is known."""
         self.is_known = False
@@ -119,7 +126,7 @@ class _WatchedAxis:
 class CycleWatch:
     """Compares every cycle with the guard's limits: plain arithmetic, nothing is made unless something is wrong."""
 
-    __slots__ = ("_all_axes", "_cam", "_guard", "_watched")
+    __slots__ = ("_all_axes", "_are_loads_carried", "_cam", "_free_motion", "_guard", "_watched")
 
     def __init__(
         self,
@@ -127,12 +134,18 @@ class CycleWatch:
         axes: Sequence[AxisChannel],
         limits: Sequence[AxisLimits] = (),
         cam: CamWindow | None = None,
+        free_motion: FreeMotion | None = None,
     ) -> None:
-        """``limits``: one an axis, none at all where left out; ``cam``: of a machine of two axes, master first."""
+        """``limits``: one an axis, none at all where left out; ``cam``: of a machine of two axes, master first.
+
+        ``free_motion``: of a machine whose model is good enough to say what an axis would do.
+        """
         self._guard = guard
         limits = tuple(limits) or (NO_LIMITS,) * len(axes)
         self._watched = tuple(_WatchedAxis(axis, limit) for axis, limit in zip(axes, limits, strict=True))
         self._cam = cam
+        self._free_motion = free_motion
+        self._are_loads_carried = False
         self._all_axes = (1 << len(axes)) - 1
         if cam is not None:
             # The first call loads the machine code, which must not happen within a cycle.
@@ -170,7 +183,8 @@ class CycleWatch:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
             if is_enabled:
-                self._check_axis(number, watched, targets[number], torque_offsets[number], now_ns)
+                is_at_rest = phase is _STANDSTILL and self._are_loads_carried
+                self._check_axis(number, watched, targets[number], torque_offsets[number], is_at_rest, now_ns)
             elif followers >> number & 1:
                 self._check_follower(number, watched, targets[number], now_ns)
             else:
@@ -194,8 +208,13 @@ class CycleWatch:
 
     def begin(self) -> None:
         """All axes are held where they stand: whatever their resolvers show there is right."""
+        self._are_loads_carried = False
         for watched in self._watched:
             watched.axis.leapt = 0
+
+    def trust_loads(self) -> None:
+        """All brakes are open: an axis that stands holds its load, by its torque."""
+        self._are_loads_carried = True
 
     def let_settle(self) -> None:
         """All axes have been left without a demand, and have to be set in motion anew: until then they may stand."""
@@ -230,7 +249,9 @@ class CycleWatch:
         else:
             guard.clear(Condition.BUS_OFF, 0)
 
-    def _check_axis(self, number: int, watched: _WatchedAxis, target: int, torque_offset: int, now_ns: int) -> None:
+    def _check_axis(
+        self, number: int, watched: _WatchedAxis, target: int, torque_offset: int, is_at_rest: bool, now_ns: int
+    ) -> None:
         axis = watched.axis
         actual, torque = axis.actual, axis.torque
         watched.error = error = (target - actual + HALF_RANGE & RANGE_MASK) - HALF_RANGE
@@ -248,7 +269,7 @@ class CycleWatch:
             self._check_drive(number, watched, now_ns)
             self._check_velocity(number, watched, target, moved, now_ns)
             if self._check_answer(number, watched, target, moved, now_ns):
-                self._check_push(number, watched, torque_offset, now_ns)
+                self._check_push(number, watched, torque_offset, is_at_rest, now_ns)
         else:
             watched.nearest = INT32_MAX
             watched.still_cycles = 0
@@ -329,10 +350,23 @@ class CycleWatch:
             guard.hold(Condition.FROZEN_ACTUAL, number, travelled, watched.frozen_counts, now_ns)
         return True
 
-    def _check_push(self, number: int, watched: _WatchedAxis, torque_offset: int, now_ns: int) -> None:
-        """Whether an axis that stands on one count is pushed more and more."""
+    def _check_push(
+        self, number: int, watched: _WatchedAxis, torque_offset: int, is_at_rest: bool, now_ns: int
+    ) -> None:
+        """Whether an axis that stands on one count is pushed more and more, or should be far away by the model."""
         guard, torque = self._guard, watched.axis.torque
+        if watched.still_cycles == 0:
+            watched.driven_way = watched.driven_counts = 0.0
         watched.still_cycles += 1
+        if self._free_motion is not None:
+            way = self._free_motion.acceleration(number, torque, None if is_at_rest else torque_offset)
+            # What its friction holds again has to be set in motion anew.
+            watched.driven_way = watched.driven_way + way if way else 0.0
+            watched.driven_counts += watched.driven_way
+            if abs(watched.driven_counts) > watched.frozen_counts and self._is_plain():
+                unforeseen, slack = torque - torque_offset, self._free_motion.slack_permille[number]
+                guard.hold(Condition.UNANSWERED_TORQUE, number, unforeseen, slack, now_ns)
+                return
         still = watched.still_torques
         if watched.still_cycles <= STILL_CYCLES[-1]:
             watched.pushed_cycles = 0

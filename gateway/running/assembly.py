@@ -4,12 +4,13 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from config.conversion import closure_at_home, five_bar
+from config.conversion import closure_at_home, five_bar, nominal_parameters
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
 from gateway.cyclic.axis_channel import AxisChannel
 from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.demand import CamDemand
+from gateway.cyclic.free_motion import FreeMotion
 from gateway.cyclic.guard import Guard
 from gateway.cyclic.listeners import SampleSink
 from gateway.cyclic.operation import Operation
@@ -115,7 +116,10 @@ def build_core(
     guard = Guard(config.guard, config.axis_names)
     law = slave_law(config, profile)
     limits, window = guard_limits(config, law)
-    watch = CycleWatch(guard, channels, limits, window)
+    is_model_good = config.feed_forward.enabled and config.feed_forward.load_check_ms > 0
+    closure = Closure(window.closure)
+    free_motion = FreeMotion(channels, nominal_parameters(config), closure, config.cycle_s) if is_model_good else None
+    watch = CycleWatch(guard, channels, limits, window, free_motion)
     deceleration = config.ordered_axes[0].limits.quick_stop_deceleration_rad_per_s2
     coupled_stop = CoupledStop(
         law,
@@ -153,7 +157,7 @@ def build_core(
         approach,
         config.recovery.timeout_s,
         config.recovery.bus_off_timeout_s,
-        build_load_check(config, Closure(window.closure)),
+        build_load_check(config, closure),
     )
     return GatewayCore(session, Operation(demand, operation_limits(config)), config.bus.sdo_frames_a_cycle)
 

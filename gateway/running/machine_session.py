@@ -265,6 +265,7 @@ class MachineSession:
             if check.is_over:
                 raise CommissioningError(check.problems)
             yield from self.power.cycles(1)
+        self.loop.steering.trust_loads()
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.

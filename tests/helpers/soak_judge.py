@@ -27,8 +27,8 @@ LOST_BOUND_DEG = 26.0
 """20 deg of the machine that the gateway knows: one axis stands at once, the other one as fast as its limits allow."""
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
-FROZEN_AT_REST_BOUND_DEG = 90.0
-FROZEN_AT_REST_SINE = 0.5
+FROZEN_AT_REST_BOUND_DEG = 75.0
+FROZEN_AT_REST_SINE = 0.6
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
 LATE_IN_TORQUE_BOUND_DEG = 45.0
 """A position loop that is closed over the bus swings up if all that it says and hears is late, or the bus too full."""
@@ -99,12 +99,15 @@ class Judge:
         self.is_frozen_at_rest = any(
             fault.kind is FaultKind.FROZEN_RESOLVER and moment in AT_REST for fault, moment in self.faults
         )
+        low, high = rig.config.ordered_axes[1].limits.position_deg or (-math.inf, math.inf)
+        self._ends_within_limits = low < math.degrees(float(rig.plant.ticks[-1][1])) < high
+        """Where a slave was lost near the end of its range, its link may stand beyond it."""
         self.figures = self._measure()
 
     @property
     def leaves_a_start(self) -> bool:
         """Whether the linkage was held well enough for a next run to begin where it stands."""
-        return not (self.unheld or self.is_frozen_at_rest)
+        return self._ends_within_limits and not (self.unheld or self.is_frozen_at_rest)
 
     def judge(self) -> list[str]:
         """What is beyond its bound, each in a sentence."""

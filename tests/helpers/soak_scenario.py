@@ -162,7 +162,7 @@ def _document(rpm: int, curve: Path, is_learning: bool, is_torque_controlled: bo
         for name, gains in TORQUE_LOOPS.items():
             document["axes"][name]["position_loop"] = gains
         # These loops are softer than the drives': friction keeps the servo axis where it stands for up to 8 counts.
-        document["guard"]["frozen_actual"]["limit_deg"] = 0.9
+        document["guard"]["frozen_actual"]["limit_deg"] = 1.5
         # And drives that are told no torque go on with the last one.
         document["guard"]["sync_lost"]["limit_cycles"] = 6
         for axis in document["axes"].values():

@@ -106,6 +106,7 @@ def cases_of_axis(node: int) -> dict[Condition, Case]:
             replaced=(
                 ("limit_permille: 2500, persistence_cycles: 100", "limit_permille: 2500, persistence_cycles: 25"),
                 ("limit_permille: 250, persistence_cycles: 8", "limit_permille: 30000, persistence_cycles: 8"),
+                ("feed_forward: {enabled: true}", "feed_forward: {enabled: true, load_check_ms: 0}"),
             ),
         ),
         Condition.MISSED_TPDO: Case(

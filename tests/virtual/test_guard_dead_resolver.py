@@ -19,7 +19,7 @@ def machine_in_torque() -> GatewayConfig:
     document = yaml.safe_load(PAPER.text)
     for name, gains in TORQUE_LOOPS.items():
         document["axes"][name]["position_loop"] = gains
-    document["guard"]["frozen_actual"]["limit_deg"] = 0.9
+    document["guard"]["frozen_actual"]["limit_deg"] = 1.5
     return parse_config(yaml.safe_dump(document), PAPER.path)
 
 
