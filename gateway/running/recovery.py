@@ -72,26 +72,33 @@ class Recovery:
         return axis.channel.silent_cycles > 0 or node.is_lost or node.boot_ups != self._boot_ups[axis.node.node_id]
 
     def _recover(self, axis: AxisSetup) -> Procedure[AxisRecovered]:
-        is_anew = had_fault = is_homed = False
         is_away = self._is_away(axis) or self._master.nodes[axis.node.node_id].state is not NmtState.OPERATIONAL
-        for _ in range(ATTEMPTS):
+        for left in reversed(range(ATTEMPTS)):
             if is_away:
-                is_anew = True
-                yield from self._bring_back(axis)
-            had_fault = had_fault or state_of(axis.channel.statusword) in FAULTY
-            yield from self._power.reset_fault(axis)
-            is_homed = axis.homing_method is None or (yield from self._power.is_homed(axis))
-            is_away = self._is_away(axis)
-            if not is_away:
-                break
-        else:
-            raise CommissioningError([f"node {axis.node.node_id} has been lost again while it was recovered"])
-        done = ["commissioned anew"] if is_anew else []
+                yield from self._await_return(axis)
+            try:
+                outcome = yield from self._make_ready(axis, is_away)
+            except (CommissioningError, NodeError):
+                if not (left and self._is_away(axis)):
+                    raise
+            else:
+                if not self._is_away(axis):
+                    return outcome
+            is_away = True
+        raise CommissioningError([f"node {axis.node.node_id} has been lost again while it was recovered"])
+
+    def _make_ready(self, axis: AxisSetup, is_away: bool) -> Procedure[AxisRecovered]:
+        if is_away:
+            yield from self._bring_back(axis)
+        had_fault = state_of(axis.channel.statusword) in FAULTY
+        yield from self._power.reset_fault(axis)
+        is_homed = axis.homing_method is None or (yield from self._power.is_homed(axis))
+        done = ["commissioned anew"] if is_away else []
         done += ["fault reset"] if had_fault else []
         done += ["ready for a new run" if is_homed else "its reference is lost: bring the linkage to its home position"]
-        return self._told(axis, is_homed, is_anew, ", ".join(done))
+        return self._told(axis, is_homed, is_away, ", ".join(done))
 
-    def _bring_back(self, axis: AxisSetup) -> Procedure[None]:
+    def _await_return(self, axis: AxisSetup) -> Procedure[None]:
         node_id, master = axis.node.node_id, self._master
         node, since_ns = master.nodes[node_id], master.now_ns
         boot_ups = self._boot_ups[node_id]
@@ -101,8 +108,11 @@ class Recovery:
         )
         if not alive:
             raise CommissioningError([f"node {node_id} has not come back within {self._timeout_s:g} s"])
+
+    def _bring_back(self, axis: AxisSetup) -> Procedure[None]:
+        node_id, master = axis.node.node_id, self._master
         yield from commission(master, [axis.node], self._network)
-        self._boot_ups[node_id] = node.boot_ups
+        self._boot_ups[node_id] = master.nodes[node_id].boot_ups
         start_nodes(master, [axis.node])
         # The count of the cycle that is under way may still be from before.
         yield from self._power.cycles(2)

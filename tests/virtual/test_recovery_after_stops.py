@@ -100,6 +100,21 @@ def test_the_axis_that_was_lost_is_commissioned_anew_and_that_one_alone(fault, t
     assert_at_rest(run)
 
 
+@pytest.mark.parametrize(
+    "after_s", [0.008, *(pytest.param(n / 1000, marks=pytest.mark.slow) for n in range(1, 31) if n != 8)]
+)
+def test_an_axis_that_loses_its_supply_while_it_is_recovered_is_not_called_ready(after_s):
+    run, _ = recover(Fault(FaultKind.OVER_CURRENT, SERVO, AT_S))
+    recovering_ns = next(e.at_ns for e in run.events if isinstance(e, StepReached) and "recovering" in e.step)
+    lost_s = recovering_ns * 1e-9 + after_s
+    run, _ = recover(Fault(FaultKind.OVER_CURRENT, SERVO, AT_S), Fault(FaultKind.POWER_CYCLE, SERVO, lost_s, 0.008))
+    told = outcomes(run)["servo"]
+    assert told.is_ready == (told.at_ns < lost_s * 1e9)
+    assert told.is_ready or told.text.endswith(LOST_REFERENCE)
+    assert outcomes(run)["cv"].is_ready
+    assert_at_rest(run)
+
+
 LOSSES = {
     FaultKind.POWER_CYCLE: (0.7, StopReason.AXIS_SILENT, f"commissioned anew, {LOST_REFERENCE}"),
     FaultKind.NODE_RESET: (None, StopReason.HEARTBEAT_LOST, f"commissioned anew, {LOST_REFERENCE}"),
