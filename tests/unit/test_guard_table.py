@@ -104,13 +104,13 @@ def test_every_condition_is_a_key_of_the_configuration_and_has_a_reason():
     assert REASON_OF[Condition.TORQUE] is StopReason.TORQUE
 
 
-def make(limits=LIMITS, **replaced):
+def make(limits=LIMITS, free_motion=None, **replaced):
     section = PAPER.guard.model_copy(update=replaced)
     guard = Guard(section, ("cv", "servo"))
     axes = [AxisChannel("cv", 1, UNITS, 200), AxisChannel("servo", 2, UNITS, 300)]
     for axis in axes:
         axis.statusword = ENABLED
-    watch = CycleWatch(guard, axes, [limits, limits], guard_limits(PAPER, slave_law(PAPER, PROFILE))[1])
+    watch = CycleWatch(guard, axes, [limits, limits], guard_limits(PAPER, slave_law(PAPER, PROFILE))[1], free_motion)
     return guard, axes, watch
 
 
@@ -366,6 +366,66 @@ def test_a_follower_that_is_driven_towards_a_far_target_and_stands_is_not_seen()
             told = cycle if guard.tripped and told is None else told
         assert told == tripped
         assert not tripped or guard.disabled == 0b10
+
+
+class Driven:
+    """A model by which the servo axis is driven in some cycles."""
+
+    slack_permille = (60, 73)
+
+    def __init__(self, acceleration, pauses=()):
+        self.value, self.pauses = acceleration, pauses
+        self.cycle, self.offsets = 0, []
+
+    def acceleration(self, number, torque, torque_offset):
+        if number == 0:
+            return 0.0
+        self.cycle += 1
+        self.offsets.append(torque_offset)
+        return 0.0 if self.cycle in self.pauses else self.value
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "pauses", "moves_in", "tripped"),
+    [
+        # n (n + 1) / 2 times a tenth of a count is more than 11 counts in the 15th cycle on one count; held for eight.
+        (0.1, (), None, 22),
+        (-0.1, (), None, 22),
+        # A cycle in which friction holds it takes the way that it has by then, not how far it has come.
+        (0.1, (10,), None, 28),
+        # A count of movement takes both.
+        (0.1, (), 12, 34),
+        (0.0, (), None, None),
+    ],
+)
+def test_an_axis_that_stands_where_it_would_have_gone_by_its_torque_is_not_seen(
+    acceleration, pauses, moves_in, tripped
+):
+    guard, axes, watch = make(free_motion=Driven(acceleration, pauses))
+    axes[1].torque = 200
+    told = None
+    for cycle in range(60):
+        axes[1].actual = 1 if moves_in is not None and cycle >= moves_in else 0
+        check(watch, cycle, phase=Phase.CAM)
+        told = cycle if guard.tripped and told is None else told
+    assert told == tripped
+    if tripped:
+        trip = guard.tripped[0]
+        assert (trip.condition, trip.axis, trip.value, trip.limit) == (Condition.UNANSWERED_TORQUE, "servo", 200, 73)
+        assert guard.disabled == 0b10
+
+
+def test_only_at_rest_and_with_open_brakes_the_load_alone_counts():
+    model = Driven(0.0)
+    _, _, watch = make(free_motion=model)
+    check(watch, 0, phase=Phase.STANDSTILL, offset=5)
+    check(watch, 1, phase=Phase.STANDSTILL, offset=5)
+    watch.trust_loads()
+    check(watch, 2, phase=Phase.STANDSTILL, offset=5)
+    check(watch, 3, phase=Phase.CAM, offset=5)
+    watch.begin()
+    check(watch, 4, phase=Phase.STANDSTILL, offset=5)
+    assert model.offsets == [5, None, 5, 5]
 
 
 def test_a_demand_that_comes_back_or_dithers_is_no_dead_resolver():
