@@ -55,6 +55,11 @@ class FeedForwardSection(Model):
     """Within this after enabling an axis has to carry what the model says that it holds, or the run is refused: longer
     than a brake takes to open after its drive says that it is enabled. 0 looks at no torque."""
 
+    @property
+    def tells_loads(self) -> bool:
+        """Whether the model is held to say what an axis that stands holds, and so what it would do without that."""
+        return self.enabled and self.load_check_ms > 0.0
+
 
 class LearnedAxisSection(Model):
     """How the error of an axis becomes torque in learning; what is left out is what its ``emulation`` gains say."""

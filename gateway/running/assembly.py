@@ -116,9 +116,10 @@ def build_core(
     guard = Guard(config.guard, config.axis_names)
     law = slave_law(config, profile)
     limits, window = guard_limits(config, law)
-    is_model_good = config.feed_forward.enabled and config.feed_forward.load_check_ms > 0
     closure = Closure(window.closure)
-    free_motion = FreeMotion(channels, nominal_parameters(config), closure, config.cycle_s) if is_model_good else None
+    free_motion = None
+    if config.feed_forward.tells_loads:
+        free_motion = FreeMotion(channels, nominal_parameters(config), closure, config.cycle_s)
     watch = CycleWatch(guard, channels, limits, window, free_motion)
     deceleration = config.ordered_axes[0].limits.quick_stop_deceleration_rad_per_s2
     coupled_stop = CoupledStop(

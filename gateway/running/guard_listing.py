@@ -124,4 +124,5 @@ def _lasting(config: GatewayConfig, rule: TorqueCondition) -> str:
     if not isinstance(rule, PushCondition):
         return ""
     lasting = [f"{name} {permille}" for name, permille in zip(config.axis_names, lasting_pushes(config), strict=True)]
-    return f"; for {PUSHED_CYCLES} cycles {', '.join(lasting)} per mille"
+    text = f"; for {PUSHED_CYCLES} cycles {', '.join(lasting)} per mille"
+    return f"{text}; or frozen_actual's way by the model" if config.feed_forward.tells_loads else text

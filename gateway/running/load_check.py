@@ -99,8 +99,7 @@ class LoadCheck:
 
 def build_load_check(config: GatewayConfig, closure: Closure) -> LoadCheck | None:
     """Of a machine whose model is good enough to be fed forward; None for any other."""
-    span_ms = config.feed_forward.load_check_ms
-    if not (config.feed_forward.enabled and span_ms):
+    if not config.feed_forward.tells_loads:
         return None
     parameters = nominal_parameters(config)
     model = Dynamics(parameters, closure)
@@ -109,4 +108,5 @@ def build_load_check(config: GatewayConfig, closure: Closure) -> LoadCheck | Non
     def torques(theta2: float, theta5: float) -> tuple[float, float]:
         return model.torque((theta2, theta5), at_rest, at_rest)
 
-    return LoadCheck(torques, parameters.coulomb_N_m, round(span_ms * 1000.0 / config.bus.cycle_us))
+    cycles = round(config.feed_forward.load_check_ms * 1000.0 / config.bus.cycle_us)
+    return LoadCheck(torques, parameters.coulomb_N_m, cycles)

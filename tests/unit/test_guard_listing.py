@@ -24,12 +24,20 @@ def test_every_condition_is_listed_in_the_machines_own_units():
         "end_effector_error": "50 mm",
         "frozen_actual": "0.45 deg: cv 5, servo 5 counts",
         # Friction of 0.04 and 0.05 N m, 27 and 33 per mille: 2.2 times that is less than half the limit.
-        "unanswered_torque": "250 per mille: cv 0.375, servo 0.375 N m; for 80 cycles cv 125, servo 125 per mille",
+        "unanswered_torque": "250 per mille: cv 0.375, servo 0.375 N m; for 80 cycles cv 125, servo 125 per mille; "
+        "or frozen_actual's way by the model",
         "emergency_warning": "EMCY 8110h, 8120h",
         "sync_lost": "20 cycles in a row",
     }
     assert rows[Condition.MISSED_TPDO].cycles == 20
     assert rows[Condition.HEARTBEAT_LOST].cycles == 1
+
+
+def test_without_a_model_nothing_is_told_of_it():
+    for section in ("enabled: false", "enabled: true, load_check_ms: 0"):
+        text = PAPER.text.replace("feed_forward: {enabled: true}", f"feed_forward: {{{section}}}")
+        rows = {row.condition: row for row in guard_rows(parse_config(text, PAPER.path))}
+        assert rows[Condition.UNANSWERED_TORQUE].limit.endswith("for 80 cycles cv 125, servo 125 per mille")
 
 
 def test_what_the_drives_do_without_the_gateway_is_told():
