@@ -221,7 +221,7 @@ def _run_virtually(
 
 def _where_the_machine_stands(read: "Recording") -> str:
     """Angles of the axes at a recording's end; nothing if they never left home."""
-    from gateway.reporting.analysis import prepare
+    from gateway.reporting.run_data import prepare
 
     data = prepare(read.samples, read.constants)
     if not data.is_following.any():

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from gateway.errors import GatewayError, UsageError
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import SampleArray
-from gateway.reporting.analysis import FOLLOWING_PHASES
+from gateway.reporting.run_data import FOLLOWING_PHASES
 from mechanism.dynamics import DynamicsParameters
 from mechanism.five_bar import Closure
 from mechanism.regressor import PARAMETER_NAMES, base_columns, from_vector, regressor, to_vector, unit_of

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from gateway.errors import GatewayError, UsageError
 from gateway.record.recording import Recording, read_recording
-from gateway.reporting.analysis import RunData, cam_of, prepare
 from gateway.reporting.figure import Figure, Theme, new_figure, render_png
+from gateway.reporting.run_data import RunData, cam_of, prepare
 
 MAX_RUNS: Final = 12
 _BINS: Final = 360

@@ -2,13 +2,11 @@
 
 from dataclasses import dataclass
 from math import tau
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from gateway.reporting.analysis import RunData
+from gateway.reporting.run_data import FloatArray, RunData
 
 MOST_LISTED: Final = 1000
 """Of more machine cycles than this, so many are listed, evenly spread, the first and the last among them."""
@@ -17,8 +15,6 @@ SHOWN: Final = (1, 2, 3, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _ROUNDING: Final = 1e-3
 """Share of a cycle's turn."""
 _DECIMALS: Final = 6
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +53,7 @@ class CycleErrors:
         }
 
 
-def cycle_errors(data: "RunData") -> CycleErrors:
+def cycle_errors(data: RunData) -> CycleErrors:
     """Greatest absolute and RMS following error of every axis in every whole revolution at constant speed."""
     axes = len(data.constants.axes)
     steady = np.flatnonzero(data.is_steady)

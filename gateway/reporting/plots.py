@@ -10,7 +10,6 @@ from matplotlib.ticker import MaxNLocator, MultipleLocator
 from numpy.typing import NDArray
 
 from gateway.record.sample import MISSED_TPDO_MASK
-from gateway.reporting.analysis import BoolArray, FloatArray, RunData
 from gateway.reporting.cycle_errors import cycle_errors
 from gateway.reporting.figure import (
     Axes,
@@ -24,6 +23,7 @@ from gateway.reporting.figure import (
     render_svg,
 )
 from gateway.reporting.paper_reference import TABLE_II, is_reference_machine
+from gateway.reporting.run_data import BoolArray, FloatArray, RunData
 
 _GRID_DEG: Final = 1.0
 _MAX_OVERLAID: Final = 24

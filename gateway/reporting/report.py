@@ -8,8 +8,9 @@ from typing import Final
 from gateway.record.lateness import IN_WORDS, LateKind
 from gateway.record.recording import Recording, RecordingError, read_recording
 from gateway.reporting import paper_reference as paper
-from gateway.reporting.analysis import RunData, RunReport, cam_of, prepare, report_of_recording
+from gateway.reporting.analysis import report_of_recording
 from gateway.reporting.event_choice import choose_events, is_alarming
+from gateway.reporting.figures import RunReport
 from gateway.reporting.number_text import number
 from gateway.reporting.plots import Plot, plots_of, to_png, to_svg
 from gateway.reporting.report_page import PAGE, STYLE
@@ -23,6 +24,7 @@ from gateway.reporting.report_text import (
     late_row,
     point,
 )
+from gateway.reporting.run_data import RunData, cam_of, prepare
 
 HTML_NAME: Final = "report.html"
 JSON_NAME: Final = "report.json"

@@ -11,7 +11,7 @@ from rich.text import Text
 
 from gateway.record.histograms import Spread, Timing
 from gateway.reporting import paper_reference as paper
-from gateway.reporting.analysis import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
+from gateway.reporting.figures import AxisFigures, CycleFigures, Distribution, PhaseFigures, RunReport
 from gateway.reporting.number_text import NOTHING, number, row_of_numbers
 
 MOST_LINES: Final = 20

@@ -23,7 +23,7 @@ from drivers.virtual_time import VirtualBus
 from gateway.cyclic.guard import StopReason
 from gateway.errors import GatewayError
 from gateway.record.sample import Phase, SampleArray, SampleLayout
-from gateway.reporting.analysis import FOLLOWING_PHASES
+from gateway.reporting.run_data import FOLLOWING_PHASES
 from gateway.running.assembly import build_core
 from gateway.running.drive_settings import build_master, node_settings
 from gateway.running.preparation import PreparedRun

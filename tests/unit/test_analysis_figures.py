@@ -8,8 +8,10 @@ import pytest
 from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 
 from gateway.record.sample import Phase, SampleArray, SampleFlag, missed_tpdo_flag
-from gateway.reporting.analysis import SMOOTHING_CYCLES, RunReport, prepare, report_of
+from gateway.reporting.analysis import report_of
+from gateway.reporting.figures import SMOOTHING_CYCLES, RunReport
 from gateway.reporting.number_text import number
+from gateway.reporting.run_data import prepare
 
 
 def report(samples: SampleArray) -> RunReport:

@@ -10,9 +10,10 @@ from recording_samples import CONSTANTS, WITHOUT_MECHANISM, steady_run
 from rich.console import Console
 
 from gateway.record.sample import Phase, missed_tpdo_flag
-from gateway.reporting.analysis import prepare, report_of
+from gateway.reporting.analysis import report_of
 from gateway.reporting.cycle_errors import MOST_LISTED, CycleErrors, cycle_errors
 from gateway.reporting.report_text import render_report
+from gateway.reporting.run_data import prepare
 
 
 def errors_of(samples):

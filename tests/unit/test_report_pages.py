@@ -19,11 +19,12 @@ from gateway.record.recording import RecordingError, RecordingMetadata, Recordin
 from gateway.record.ring import RingReader, RingWriter, RunEvent, RunState
 from gateway.record.run_constants import RunConstants
 from gateway.record.sample import Phase, SampleArray, missed_tpdo_flag
-from gateway.reporting.analysis import analyse, prepare, report_of
+from gateway.reporting.analysis import analyse, report_of
 from gateway.reporting.monitor import Monitor, last_cycle, monitor, render_view, sparkline
 from gateway.reporting.plots import overlay, plots_of, to_png, to_svg
 from gateway.reporting.report import write_report
 from gateway.reporting.report_text import render_report
+from gateway.reporting.run_data import prepare
 
 
 def record(path: Path, samples: SampleArray, constants: RunConstants = CONSTANTS) -> Path:

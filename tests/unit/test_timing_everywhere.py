@@ -15,11 +15,12 @@ from gateway.record.histograms import CycleCounts, Timing
 from gateway.record.recording import RecordingMetadata, RecordingWriter
 from gateway.record.ring import RingReader, RingWriter
 from gateway.record.sample import SampleFlag, missed_tpdo_flag
-from gateway.reporting.analysis import prepare, report_of
+from gateway.reporting.analysis import report_of
 from gateway.reporting.monitor import Monitor, render_view
 from gateway.reporting.plots import plots_of, to_svg
 from gateway.reporting.report import write_report
 from gateway.reporting.report_text import render_report
+from gateway.reporting.run_data import prepare
 
 COUNTS = CycleCounts(
     missed_tpdo=3, late_tpdo=4, missed_rpdo_deadline=5, overruns=6, sync_lost=17, bus_errors=8, send_buffer_full=9
