@@ -49,6 +49,8 @@ class AxisLimits:
 
 
 NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX, INT32_MAX)
+PASSING_CYCLES: Final = 4
+"""For so long a slow axis stands on every count; what it does meanwhile is not asked for."""
 STILL_CYCLES: Final = (8, 16, 24)
 """So long after its last count an axis' torque is looked at, and the middle one taken for what its standing takes: a
 count of the demand, or of the resolver's noise, is a blow to a controller, and may hit one of them."""
@@ -172,6 +174,7 @@ class CycleWatch:
             self._check_missing(awaited, now_ns)
         elif not guard.is_quiet:
             guard.clear(Condition.BUS_OFF, 0)
+        is_at_rest = phase is _STANDSTILL and self._are_loads_carried
         for number, watched in enumerate(self._watched):
             if awaited >> number & 1:
                 continue
@@ -183,7 +186,6 @@ class CycleWatch:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
             if is_enabled:
-                is_at_rest = phase is _STANDSTILL and self._are_loads_carried
                 self._check_axis(number, watched, targets[number], torque_offsets[number], is_at_rest, now_ns)
             elif followers >> number & 1:
                 self._check_follower(number, watched, targets[number], now_ns)
@@ -358,7 +360,7 @@ class CycleWatch:
         if watched.still_cycles == 0:
             watched.driven_way = watched.driven_counts = 0.0
         watched.still_cycles += 1
-        if self._free_motion is not None:
+        if self._free_motion is not None and watched.still_cycles > PASSING_CYCLES:
             way = self._free_motion.acceleration(number, torque, None if is_at_rest else torque_offset)
             # What its friction holds again has to be set in motion anew.
             watched.driven_way = watched.driven_way + way if way else 0.0

@@ -28,7 +28,7 @@ LOST_BOUND_DEG = 26.0
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
 FROZEN_AT_REST_BOUND_DEG = 75.0
-FROZEN_AT_REST_SINE = 0.6
+FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
 LATE_IN_TORQUE_BOUND_DEG = 45.0
 """A position loop that is closed over the bus swings up if all that it says and hears is late, or the bus too full."""
