@@ -163,9 +163,14 @@ class Judge:
             # From a controlled stop it may be gone over to a quick one late.
             quick_ns = next(at_ns for at_ns, phase in session.phases if phase is Phase.QUICK_STOP)
             angles = angles[times_ns[stopped] >= quick_ns - QUICK_SHOWN_NS]
+        called_ns = self.stop_ns
+        if session.killed_ns is not None:
+            # It may be in the middle of a controlled stop, which takes longer than the drives do.
+            called_ns = session.killed_ns
+            angles = angles[times_ns[stopped] >= called_ns]
         moving = np.abs(angles - angles[-1]).max(axis=1) > TWO_COUNTS_RAD
         rest_s = float((np.flatnonzero(moving)[-1] + 1) * TICK_S) if moving.any() else 0.0
-        torque_off_s = max((session.powered_until_ns - self.stop_ns) / SECOND, 0.0)
+        torque_off_s = max((session.powered_until_ns - called_ns) / SECOND, 0.0)
         torque = self._shaft_torque(angles, parameters)
         return Figures(
             self.stop, float(sines[0]), least_sine, running, cam_deg, effector_mm, rest_s, torque_off_s, torque
