@@ -46,12 +46,14 @@ class FreeMotion:
         # The first call loads the machine code, which must not happen within a cycle.
         self.acceleration(0, 1000, 0)
 
-    def acceleration(self, number: int, torque: int, torque_offset: int | None) -> float:
+    def acceleration(
+        self, number: int, torque: int, torque_offset: int | None, velocities: Sequence[float] = (0.0, 0.0)
+    ) -> float:
         """Counts per cycle^2 of axis ``number`` under ``torque``, 0 where that holds it, or may.
 
         What the torque offset foresees is no drive, nor is what the axis holds at rest, whichever explains more:
-        offsets come in by and by, and say more than the load at rest of an axis that stands while the other one moves.
-        None: both are at rest, and only the load counts. In per mille of rated torque.
+        offsets come in by and by, but know of accelerations. None: nothing is foreseen, and only the load counts. In
+        per mille of rated torque; ``velocities`` are the demand's (rad/s): the other axis' loads this one.
         """
         unit, slack = self._permille_Nm[number], self._friction_Nm[number]
         foreseen = 0.0 if torque_offset is None else unit * torque_offset
@@ -59,7 +61,8 @@ class FreeMotion:
         if torque_offset is not None and -slack <= unforeseen <= slack:
             return 0.0
         theta2, theta5 = (axis.units.angle(axis.actual - axis.leapt) for axis in self._axes)
-        m11, _, m22, h1, h2 = mass_matrix_and_bias(self._values, theta2, theta5, 0.0, 0.0, self._closure)
+        omega2, omega5 = (velocities[0], 0.0) if number else (0.0, velocities[1])
+        m11, _, m22, h1, h2 = mass_matrix_and_bias(self._values, theta2, theta5, omega2, omega5, self._closure)
         inertia, load = (m22, h2) if number else (m11, h1)
         unheld = unit * torque - load
         if torque_offset is None:

@@ -255,8 +255,11 @@ class CoupledStop:
         return axis.silent_cycles == 0 and axis.statusword & STATUSWORD_STATE_MASK != STATUSWORD_OPERATION_ENABLED
 
     def _is_led(self, slave: AxisChannel) -> bool:
-        if slave.position_loop is None or slave.silent_cycles:
+        if slave.position_loop is None:
             return True
+        if slave.silent_cycles:
+            # A loop that hears nothing gives the torque that it gave last.
+            return slave.silent_cycles <= LEAP_GAP_CYCLES
         return abs(wrap_counts(self._slave_targets[0] - slave.actual + slave.leapt)) <= self._led_counts
 
     def _observe(self) -> None:

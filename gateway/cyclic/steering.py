@@ -212,11 +212,19 @@ class Steering:
             # Drives without torque call for no reaction; which of them is there is asked all the same.
             self._watch.note_silence(awaited)
             return
-        master_position, _, _, targets, torque_offsets, phase = self.in_force
+        master_position, _, velocities, targets, torque_offsets, phase = self.in_force
         stop = self._coupled_stop
         followers = stop.followers if stop is not None and self._demand is stop and phase is Phase.QUICK_STOP else 0
         self._watch.check(
-            awaited, targets, torque_offsets, master_position, phase, self.is_guarding_enabled, followers, now_ns
+            awaited,
+            targets,
+            torque_offsets,
+            velocities,
+            master_position,
+            phase,
+            self.is_guarding_enabled,
+            followers,
+            now_ns,
         )
         if self.guard.tripped:
             self.react()

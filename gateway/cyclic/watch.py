@@ -158,16 +158,18 @@ class CycleWatch:
         awaited: int,
         targets: Sequence[int],
         torque_offsets: Sequence[int],
+        velocities: Sequence[float],
         master_position: float,
         phase: Phase,
         is_enabled: bool,
         followers: int,
         now_ns: int,
     ) -> None:
-        """One cycle. ``awaited``: bit n, the TPDO of axis n is missing; ``targets`` (counts), ``torque_offsets`` (per
-        mille), ``master_position`` (rad) and ``phase`` are those in force at its SYNC; ``is_enabled``: all drives are
-        meant to be in Operation enabled; ``followers``: bit n, axis n still follows its targets in a stop in which they
-        are not.
+        """One cycle. ``awaited``: bit n, the TPDO of axis n is missing.
+
+        ``targets`` (counts), ``torque_offsets`` (per mille), ``velocities`` (rad/s), ``master_position`` (rad) and
+        ``phase`` are those in force at its SYNC; ``is_enabled``: all drives are meant to be in Operation enabled;
+        ``followers``: bit n, axis n still follows its targets in a stop in which they are not.
         """
         guard = self._guard
         if awaited:
@@ -186,7 +188,8 @@ class CycleWatch:
                 guard.clear(Condition.MISSED_TPDO, number)
                 guard.clear(Condition.AXIS_SILENT, number)
             if is_enabled:
-                self._check_axis(number, watched, targets[number], torque_offsets[number], is_at_rest, now_ns)
+                offset = torque_offsets[number]
+                self._check_axis(number, watched, targets[number], offset, velocities, is_at_rest, now_ns)
             elif followers >> number & 1:
                 self._check_follower(number, watched, targets[number], now_ns)
             else:
@@ -252,7 +255,14 @@ class CycleWatch:
             guard.clear(Condition.BUS_OFF, 0)
 
     def _check_axis(
-        self, number: int, watched: _WatchedAxis, target: int, torque_offset: int, is_at_rest: bool, now_ns: int
+        self,
+        number: int,
+        watched: _WatchedAxis,
+        target: int,
+        torque_offset: int,
+        velocities: Sequence[float],
+        is_at_rest: bool,
+        now_ns: int,
     ) -> None:
         axis = watched.axis
         actual, torque = axis.actual, axis.torque
@@ -271,7 +281,11 @@ class CycleWatch:
             self._check_drive(number, watched, now_ns)
             self._check_velocity(number, watched, target, moved, now_ns)
             if self._check_answer(number, watched, target, moved, now_ns):
-                self._check_push(number, watched, torque_offset, is_at_rest, now_ns)
+                if self._free_motion is not None:
+                    # The offsets are the cam's, and have to come in first.
+                    foreseen = None if is_at_rest or not self._is_plain() else torque_offset
+                    self._drive(self._free_motion, number, watched, foreseen, velocities)
+                self._check_push(number, watched, torque_offset, now_ns)
         else:
             watched.nearest = INT32_MAX
             watched.still_cycles = 0
@@ -352,23 +366,27 @@ class CycleWatch:
             guard.hold(Condition.FROZEN_ACTUAL, number, travelled, watched.frozen_counts, now_ns)
         return True
 
-    def _check_push(
-        self, number: int, watched: _WatchedAxis, torque_offset: int, is_at_rest: bool, now_ns: int
+    @staticmethod
+    def _drive(
+        model: FreeMotion, number: int, watched: _WatchedAxis, foreseen: int | None, velocities: Sequence[float]
     ) -> None:
+        """One more cycle of the way that an axis that stands would have gone."""
+        if watched.still_cycles < PASSING_CYCLES:
+            watched.driven_way = watched.driven_counts = 0.0
+            return
+        way = model.acceleration(number, watched.axis.torque, foreseen, velocities)
+        # What its friction holds again has to be set in motion anew.
+        watched.driven_way = watched.driven_way + way if way else 0.0
+        watched.driven_counts += watched.driven_way
+
+    def _check_push(self, number: int, watched: _WatchedAxis, torque_offset: int, now_ns: int) -> None:
         """Whether an axis that stands on one count is pushed more and more, or should be far away by the model."""
         guard, torque = self._guard, watched.axis.torque
-        if watched.still_cycles == 0:
-            watched.driven_way = watched.driven_counts = 0.0
         watched.still_cycles += 1
-        if self._free_motion is not None and watched.still_cycles > PASSING_CYCLES:
-            way = self._free_motion.acceleration(number, torque, None if is_at_rest else torque_offset)
-            # What its friction holds again has to be set in motion anew.
-            watched.driven_way = watched.driven_way + way if way else 0.0
-            watched.driven_counts += watched.driven_way
-            if abs(watched.driven_counts) > watched.frozen_counts and self._is_plain():
-                unforeseen, slack = torque - torque_offset, self._free_motion.slack_permille[number]
-                guard.hold(Condition.UNANSWERED_TORQUE, number, unforeseen, slack, now_ns)
-                return
+        if self._free_motion is not None and abs(watched.driven_counts) > watched.frozen_counts:
+            unforeseen, slack = torque - torque_offset, self._free_motion.slack_permille[number]
+            guard.hold(Condition.UNANSWERED_TORQUE, number, unforeseen, slack, now_ns)
+            return
         still = watched.still_torques
         if watched.still_cycles <= STILL_CYCLES[-1]:
             watched.pushed_cycles = 0

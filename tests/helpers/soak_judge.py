@@ -27,10 +27,12 @@ LOST_BOUND_DEG = 26.0
 """20 deg of the machine that the gateway knows: one axis stands at once, the other one as fast as its limits allow."""
 LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
+DEAF_BOUND_DEG = 34.0
+"""A slave whose drive hears nothing is told by `cam_window`, 20 deg, and its master has to be stopped then."""
 FROZEN_AT_REST_BOUND_DEG = 75.0
 FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
-LATE_IN_TORQUE_BOUND_DEG = 45.0
+LATE_IN_TORQUE_BOUND_DEG = 40.0
 """A position loop that is closed over the bus swings up if all that it says and hears is late, or the bus too full."""
 LEAST_SINE = 0.7
 SINE_LOSS = 0.15
@@ -311,6 +313,8 @@ class Judge:
         bound = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
         if self.is_frozen_at_rest:
             bound = FROZEN_AT_REST_BOUND_DEG
+        if any(fault.kind in FRAMES and fault.node_id == SERVO for fault, _ in self.faults):
+            bound = max(bound, DEAF_BOUND_DEG)
         return max(bound, LATE_IN_TORQUE_BOUND_DEG) if self._is_late_in_torque() else bound
 
     def _is_in_torque(self) -> bool:

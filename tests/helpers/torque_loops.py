@@ -1,5 +1,10 @@
 """Position loops that the gateway closes itself on the paper's machine: softer than the drives' own."""
 
+import yaml
+
+from config.loading import load_config, parse_config
+from config.schema import GatewayConfig
+
 TORQUE_LOOPS = {
     "cv": {
         "proportional_Nm_per_rad": 20,
@@ -14,3 +19,15 @@ TORQUE_LOOPS = {
         "torque_limit_Nm": 4.5,
     },
 }
+SOFT_FROZEN_DEG = 1.5
+"""Dry friction holds an axis for longer behind them."""
+
+
+def machine_in_torque() -> GatewayConfig:
+    """The paper's machine behind these loops."""
+    paper = load_config("paper")
+    document = yaml.safe_load(paper.text)
+    for name, gains in TORQUE_LOOPS.items():
+        document["axes"][name]["position_loop"] = gains
+    document["guard"]["frozen_actual"]["limit_deg"] = SOFT_FROZEN_DEG
+    return parse_config(yaml.safe_dump(document), paper.path)

@@ -116,7 +116,7 @@ def make(limits=LIMITS, free_motion=None, **replaced):
 
 def check(watch, cycle, demand=0, awaited=0, phase=Phase.STANDSTILL, offset=0, is_enabled=True, followers=0):
     """One cycle in which the servo axis' target is ``demand``, its torque offset ``offset``."""
-    watch.check(awaited, [0, demand], [0, offset], 0.0, phase, is_enabled, followers, cycle)
+    watch.check(awaited, [0, demand], [0, offset], [0.0, 0.0], 0.0, phase, is_enabled, followers, cycle)
 
 
 def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
@@ -296,7 +296,7 @@ def test_what_is_passed_over_changes_nothing_that_the_guard_says(limit_mm):
             for axis in axes:
                 axis.statusword = ENABLED
             axes[0].actual, axes[1].actual = -master, -slave
-            watch.check(0, [0, 0], [0, 0], angle, Phase.CAM, True, 0, cycle)
+            watch.check(0, [0, 0], [0, 0], [0.0, 0.0], angle, Phase.CAM, True, 0, cycle)
             counts.append([guard.is_holding(one, 0) for one in (Condition.CAM_WINDOW, Condition.END_EFFECTOR_ERROR)])
         outcomes.append((counts, [(trip.at_ns, trip.condition, trip.value) for trip in guard.tripped]))
     assert outcomes[0] == outcomes[1]
@@ -377,7 +377,7 @@ class Driven:
         self.value, self.pauses = acceleration, pauses
         self.cycle, self.offsets = 0, []
 
-    def acceleration(self, number, torque, torque_offset):
+    def acceleration(self, number, torque, torque_offset, velocities):
         if number == 0:
             return 0.0
         self.cycle += 1

@@ -3,25 +3,12 @@
 import math
 
 import pytest
-import yaml
 from guarded_machine import CV, PAPER, SERVO, Guarded, StopReason, at_theta2
-from torque_loops import TORQUE_LOOPS
+from torque_loops import machine_in_torque
 
-from config.loading import parse_config
-from config.schema import GatewayConfig
 from gateway.cyclic.guard import Condition
 from gateway.errors import CommissioningError
 from sim_drive.injection.faults import Direction, Fault, FaultKind
-
-
-def machine_in_torque() -> GatewayConfig:
-    """The paper's machine with the gateway's own, softer, position loops."""
-    document = yaml.safe_load(PAPER.text)
-    for name, gains in TORQUE_LOOPS.items():
-        document["axes"][name]["position_loop"] = gains
-    document["guard"]["frozen_actual"]["limit_deg"] = 1.5
-    return parse_config(yaml.safe_dump(document), PAPER.path)
-
 
 FROZEN = (Condition.FROZEN_ACTUAL, Condition.UNANSWERED_TORQUE)
 
@@ -254,3 +241,29 @@ def test_a_leap_that_goes_back_as_the_stop_ends_does_not_set_the_slave_off(back_
     strain = run.strain(2.2)
     assert math.degrees(strain.cam_distance_rad) < 4.0
     assert strain.least_sine > 0.79
+
+
+@pytest.mark.parametrize(
+    ("kind", "at_s"),
+    [
+        (FaultKind.LOST_FRAMES, 1.749),
+        *(
+            pytest.param(kind, at_s, marks=pytest.mark.slow)
+            for kind in (FaultKind.LOST_FRAMES, FaultKind.LATE_FRAMES)
+            for at_s in (1.321, 1.749, 2.749, 3.214, 3.856)
+            if (kind, at_s) != (FaultKind.LOST_FRAMES, 1.749)
+        ),
+    ],
+)
+def test_a_slave_whose_loop_hears_nothing_of_it_is_left_to_its_drive(kind, at_s):
+    """A loop closed over the bus gives the torque that it gave last: the slave was carried off by up to 160 deg."""
+    fault = {
+        FaultKind.LOST_FRAMES: {"cob_id": 0x182, "direction": Direction.SENT},
+        # SYNC so late that every TPDO misses its deadline.
+        FaultKind.LATE_FRAMES: {"cob_id": 0x80, "direction": Direction.RECEIVED, "delay_s": 0.00046},
+    }[kind]
+    run = Guarded(Fault(kind, SERVO, at_s, 0.4, **fault), config=machine_in_torque()).to_end()
+    assert run.stopped_by is StopReason.AXIS_SILENT
+    strain = run.strain(at_s)
+    assert strain.least_sine > 0.79
+    assert math.degrees(strain.cam_distance_rad) < 12.0

@@ -4,12 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from guarded_machine import PAPER, SECOND, Guarded, at_theta2, changed
+from guarded_machine import PAPER, SECOND, SERVO, Guarded, at_theta2, changed
+from torque_loops import machine_in_torque
 from turning_machine import turning_config
 
-from gateway.cyclic.guard import StopReason
+from gateway.cyclic.guard import Condition, StopReason
 from gateway.cyclic.operation import Order, OrderAnswered
 from gateway.record.sample import Phase, SampleLayout
+from sim_drive.injection.faults import Fault, FaultKind
 
 LAYOUT = SampleLayout(PAPER.axis_names)
 
@@ -184,6 +186,26 @@ def test_before_the_motion_every_order_is_refused():
     assert Operated().order(0.05, Order.OVERRIDE, 50.0).until(0.06).refusals == [
         "the machine is not in motion on its cam"
     ]
+
+
+@pytest.mark.parametrize("is_in_torque", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "after_s", [0.07, *(pytest.param(n * 0.07, marks=pytest.mark.slow) for n in range(16) if n != 1)]
+)
+def test_a_resolver_that_dies_with_the_slave_off_its_cam_does_not_let_it_run_away(after_s, is_in_torque):
+    """Its demand stands, and no torque offset foresees its load: it made eight revolutions, and tore the linkage."""
+    at_s = at_theta2(250) + after_s
+    config = machine_in_torque() if is_in_torque else PAPER
+    run = Operated(Fault(FaultKind.FROZEN_RESOLVER, SERVO, at_s), cycles=3, config=config)
+    run.order(at_theta2(180), Order.DISENGAGE, 200.0).until(at_s)
+    parked = run.machine.plant.angle(1)
+    run.to_end()
+    assert [trip.condition for trip in run.trips][:1] == [Condition.UNANSWERED_TORQUE]
+    assert not run.is_torn
+    farthest = max(
+        abs(record.angles_rad[1] - parked) for record in run.machine.records if record.at_ns >= at_s * SECOND
+    )
+    assert math.degrees(farthest) < (110.0 if is_in_torque else 30.0)
 
 
 @pytest.mark.slow
