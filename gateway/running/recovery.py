@@ -68,11 +68,12 @@ class Recovery:
 
     def _is_away(self, axis: AxisSetup) -> bool:
         """Silent, or back again from somewhere, since it was commissioned."""
-        node = self._master.nodes[axis.node.node_id]
-        return axis.channel.silent_cycles > 0 or node.is_lost or node.boot_ups != self._boot_ups[axis.node.node_id]
+        node_id = axis.node.node_id
+        return axis.channel.silent_cycles > 0 or self._master.nodes[node_id].boot_ups != self._boot_ups[node_id]
 
     def _recover(self, axis: AxisSetup) -> Procedure[AxisRecovered]:
-        is_away = self._is_away(axis) or self._master.nodes[axis.node.node_id].state is not NmtState.OPERATIONAL
+        node = self._master.nodes[axis.node.node_id]
+        is_away = self._is_away(axis) or node.is_lost or node.state is not NmtState.OPERATIONAL
         for left in reversed(range(ATTEMPTS)):
             if is_away:
                 yield from self._await_return(axis)
