@@ -74,13 +74,14 @@ class Recovery:
     def _recover(self, axis: AxisSetup) -> Procedure[AxisRecovered]:
         node = self._master.nodes[axis.node.node_id]
         is_away = self._is_away(axis) or node.is_lost or node.state is not NmtState.OPERATIONAL
-        for left in reversed(range(ATTEMPTS)):
+        for _ in range(ATTEMPTS):
             if is_away:
                 yield from self._await_return(axis)
             try:
                 outcome = yield from self._make_ready(axis, is_away)
             except (CommissioningError, NodeError):
-                if not (left and self._is_away(axis)):
+                # A node that is being commissioned is silent in any case.
+                if is_away or not self._is_away(axis):
                     raise
             else:
                 if not self._is_away(axis):
