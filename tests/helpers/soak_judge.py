@@ -29,6 +29,8 @@ LOST_OF_TWO_BOUND_DEG = 30.0
 """If something else has gone wrong as well."""
 DEAF_BOUND_DEG = 34.0
 """A slave whose drive hears nothing is told by `cam_window`, 20 deg, and its master has to be stopped then."""
+BOTH_LOST_BOUND_DEG = 60.0
+"""Each axis has failed by itself: nobody is left who could follow."""
 FROZEN_AT_REST_BOUND_DEG = 75.0
 FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
@@ -56,6 +58,8 @@ SLAVE_UNABLE = {Mischief.HOST_AWAY, Mischief.HOST_LATE, Mischief.CONTROLLER_OFF}
 """Nobody tells the slave, for a while, where the master is."""
 ORDERS = tuple(ORDER_OF)
 FRAMES = (FaultKind.LATE_FRAMES, FaultKind.REORDERED_FRAMES, FaultKind.LOST_FRAMES, FaultKind.DOUBLED_FRAMES)
+FATAL = (*TRIPS, *RESTARTS, FaultKind.BUS_OFF, FaultKind.FROZEN_RESOLVER)
+"""The axis cannot be relied on afterwards."""
 SEEN_LEAP_COUNTS = {CV: 26, SERVO: 45}
 """Twice the velocity limit of an axis, and noise: whatever leaps farther is known to have leapt."""
 
@@ -313,6 +317,8 @@ class Judge:
         bound = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
         if self.is_frozen_at_rest:
             bound = FROZEN_AT_REST_BOUND_DEG
+        if {CV, SERVO} <= {fault.node_id for fault, _ in self.faults if fault.kind in FATAL}:
+            bound = BOTH_LOST_BOUND_DEG
         if any(fault.kind in FRAMES and fault.node_id == SERVO for fault, _ in self.faults):
             bound = max(bound, DEAF_BOUND_DEG)
         return max(bound, LATE_IN_TORQUE_BOUND_DEG) if self._is_late_in_torque() else bound
