@@ -117,6 +117,7 @@ class Passing:
     """What comes and goes."""
 
 
+@pytest.mark.slow
 def test_what_is_left_behind_at_every_campaign_is_found_and_what_comes_and_goes_is_not():
     watch, kept, passing = LeakWatch(), [], []
     for number in range(6):
