@@ -218,7 +218,7 @@ class MachineSession:
         self._step("enabling the axes")
         yield from for_all(self._nodes, lambda node: self.power.set_mode(self._axis(node), _cyclic_mode(node)))
         before = [axis.channel.actual for axis in self.axes]
-        problems = self._away_from_start(before, "stands at")
+        problems = self._away_from_start(before)
         if problems and self._approach is not None:
             self._way = self._find_way(self._approach)
         elif problems:
@@ -226,14 +226,16 @@ class MachineSession:
         # Until now the target of each axis was its actual position; from here on it is held where it then is.
         yield from for_all(self._nodes, lambda node: self.power.enable(self._axis(node)))
         held = [axis.channel.target for axis in self.axes]
-        problems = self._moved_apart(before, held) if self._way else self._away_from_start(held, "is now held at")
-        problems = problems or self._moved_apart(held, [axis.channel.actual for axis in self.axes])
+        # Not from the cam's start again: an axis at the edge of that window sinks by a count as its brake opens.
+        problems = self._moved_apart(before, held) or self._moved_apart(
+            held, [axis.channel.actual for axis in self.axes]
+        )
         if problems:
             raise CommissioningError(problems)
         self.loop.steering.begin_guarding()
         self.loop.steering.phase = Phase.STANDSTILL
 
-    def _away_from_start(self, positions: Sequence[int], what: str) -> list[str]:
+    def _away_from_start(self, positions: Sequence[int]) -> list[str]:
         """What is wrong with ``positions`` (counts) as a place to begin the plan from: a sentence an axis."""
         master, slave = positions
         problems: list[str] = []
@@ -243,8 +245,8 @@ class MachineSession:
             window = axis.channel.units.counts_in(START_WINDOW_RAD)
             if abs(position - target) > window:
                 problems.append(
-                    f"axis {axis.node.name}: {what} {position} counts, the cam starts at {target}, which is more than "
-                    f"{window} counts away; bring the linkage to its home position, or start from where it stands "
+                    f"axis {axis.node.name}: stands at {position} counts, the cam starts at {target}, which is more "
+                    f"than {window} counts away; bring the linkage to its home position, or start from where it stands "
                     "(--from-here)"
                 )
         return problems
