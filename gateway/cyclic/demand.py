@@ -124,7 +124,7 @@ class CamDemand:
         return None if self._torques is None else self._torques.learned
 
     def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
-        """Learn from the following errors of a cycle (see `cycle.ErrorObserver`), if they are the cam's alone.
+        """Learn from the following errors of a cycle (see `listeners.ErrorObserver`), if they are the cam's alone.
 
         They are not while the axes are still being brought onto the plan, or the slave is moved apart from the cam.
         """

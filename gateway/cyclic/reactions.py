@@ -97,7 +97,7 @@ class _SeenAxis:
 class _LeapInTarget:
     """What an axis' resolver shows too much, as far as that is in the axis' target."""
 
-    __slots__ = ("_axis", "_goal", "_left", "calm_cycles", "counts")
+    __slots__ = ("_axis", "_calm_cycles", "_goal", "_left", "counts")
 
     def __init__(self, axis: AxisChannel) -> None:
         self._axis = axis
@@ -109,7 +109,7 @@ class _LeapInTarget:
         self._left = 0
         """Cycles in which the goal is to be reached."""
         self.counts = 0
-        self.calm_cycles = CALM_CYCLES
+        self._calm_cycles = CALM_CYCLES
         """Since the target has jumped: a drive's own stop begins with the speed of its targets."""
 
     def step(self) -> None:
@@ -121,14 +121,14 @@ class _LeapInTarget:
         if self._left:
             self.counts += round((self._goal - self.counts) / self._left)
             self._left -= 1
-            self.calm_cycles = 0
+            self._calm_cycles = 0
         else:
-            self.calm_cycles += 1
+            self._calm_cycles += 1
 
     @property
     def is_calm(self) -> bool:
         """Whether the drive has long had a target that has not jumped."""
-        return self.calm_cycles > CALM_CYCLES
+        return self._calm_cycles > CALM_CYCLES
 
 
 class CoupledStop:

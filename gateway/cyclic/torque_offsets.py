@@ -95,7 +95,7 @@ class TorqueOffsets:
         return [units[0].permille(share * master), units[1].permille(share * slave)]
 
     def observe(self, master_position: float, master_velocity: float, errors: Sequence[int], is_steady: bool) -> None:
-        """Learn from the following errors of a cycle; see `gateway.cyclic.cycle.ErrorObserver`."""
+        """Learn from the following errors of a cycle; see `gateway.cyclic.listeners.ErrorObserver`."""
         if self._learning is not None:
             master, slave = self._rad_per_count
             self._learning.observe(master_position, master_velocity, is_steady, master * errors[0], slave * errors[1])

@@ -29,6 +29,7 @@ class GatewayCore:
         """
         self.session = session
         self.loop = session.loop
+        self.steering = session.steering
         self.master = session.master
         self.is_done = False
         self._guard = session.guard
@@ -130,9 +131,9 @@ class GatewayCore:
         back to disabled drives. May be called repeatedly.
         """
         self.session.is_stop_requested = True
-        if self.loop.steering.is_guarding_enabled:
+        if self.steering.is_guarding_enabled:
             self._guard.hold(wish, 0, 1, 1, self.master.now_ns)
-            self.loop.steering.react()
+            self.steering.react()
 
     def order(self, order: Order, value: float) -> None:
         """Carry out an operator's order, or refuse it; an ``OrderAnswered`` tells which."""
@@ -149,7 +150,7 @@ class GatewayCore:
         """Quick stop on all drives."""
         self.session.is_stop_requested = True
         if self.loop.is_running:
-            self.loop.steering.quick_stop()
+            self.steering.quick_stop()
 
     # -- the own controller --------------------------------------------------------------------------------------
 
@@ -189,7 +190,7 @@ class GatewayCore:
             return
         self.master.events = []
         self._events += events
-        if not self.loop.steering.is_guarding_enabled:
+        if not self.steering.is_guarding_enabled:
             if self.session.is_watching_nodes:
                 self._lost += [
                     f"axis {self.session.axes[self._axis_of_node[event.node_id]].node.name}: node {event.node_id} "
@@ -209,11 +210,11 @@ class GatewayCore:
                 self._guard.hold(
                     Condition.HEARTBEAT_LOST, self._axis_of_node[event.node_id], timeout_ms, timeout_ms, now_ns
                 )
-        self.loop.steering.react()
+        self.steering.react()
 
     def _resume(self, now_ns: int) -> None:
         if self._guard.tripped:
-            self.loop.steering.react()
+            self.steering.react()
             self._events += self._guard.tripped
             self._guard.tripped = []
         if self.is_done:

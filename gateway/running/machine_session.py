@@ -98,6 +98,7 @@ class MachineSession:
         self.network = network
         self.master = master
         self.loop = loop
+        self.steering = loop.steering
         self.demand = demand
         self.plan = plan
         """Of the master; an approach replaces it by one from where it has ended."""
@@ -232,8 +233,8 @@ class MachineSession:
         )
         if problems:
             raise CommissioningError(problems)
-        self.loop.steering.begin_guarding()
-        self.loop.steering.phase = Phase.STANDSTILL
+        self.steering.begin_guarding()
+        self.steering.phase = Phase.STANDSTILL
 
     def _away_from_start(self, positions: Sequence[int]) -> list[str]:
         """What is wrong with ``positions`` (counts) as a place to begin the plan from: a sentence an axis."""
@@ -267,23 +268,23 @@ class MachineSession:
             if check.is_over:
                 raise CommissioningError(check.problems)
             yield from self.power.cycles(1)
-        self.loop.steering.trust_loads()
+        self.steering.trust_loads()
 
     def _move(self) -> Procedure[None]:
         # Standing under guard first: a drive that cannot hold still must not be asked to move.
         yield from self.master.pause(SETTLE_S)
-        loop, demand, guard = self.loop, self.demand, self.guard
+        demand, guard = self.demand, self.guard
         # What has called for a stop since the drives were commissioned has called for no motion at all.
         if self.may_move() and self._approach is not None and self._way:
             yield from self._go_onto_cam(self._approach)
         if self.may_move():
             self._step("moving")
             demand.begin(self.plan, [axis.channel.target for axis in self.axes])
-            loop.steering.follow(demand, demand.observer)
+            self.steering.follow(demand, demand.observer)
             self.is_following = True
             yield from self._until_finished(demand)
         self.stopped_by = guard.stopped_by or (StopReason.OPERATOR if self.is_stop_requested else StopReason.COMPLETED)
-        if loop.steering.phase is not Phase.QUICK_STOP:
+        if self.steering.phase is not Phase.QUICK_STOP:
             yield from self.master.pause(SETTLE_S)
             # Guarded until the end; but a wish to stop that comes now finds the run completed.
             reason = guard.stopped_by
@@ -291,15 +292,14 @@ class MachineSession:
                 self.stopped_by = reason
         if self.stopped_by is StopReason.COMPLETED and not demand.law.is_plain:
             self._step("the slave ends off its cam: give the next run --from-here")
-        if loop.steering.phase is Phase.QUICK_STOP:
+        if self.steering.phase is Phase.QUICK_STOP:
             self._step("quick stop")
 
     def _until_finished(self, demand: CamDemand | ApproachDemand) -> Procedure[None]:
         """Let the cycle follow its demand until that, or a stop that leaves it, is over."""
-        loop = self.loop
-        while not (demand.is_finished or loop.steering.phase is Phase.QUICK_STOP or self.bus.is_given_up):
+        while not (demand.is_finished or self.steering.phase is Phase.QUICK_STOP or self.bus.is_given_up):
             if self.is_stop_requested:
-                loop.steering.controlled_stop()
+                self.steering.controlled_stop()
             yield self.master.now_ns + NS_PER_S
 
     def may_move(self) -> bool:
@@ -318,7 +318,7 @@ class MachineSession:
         self._step("approaching the cam")
         demand = approach.demand
         demand.begin(self._way, [axis.channel.target for axis in self.axes])
-        self.loop.steering.follow(demand)
+        self.steering.follow(demand)
         yield from self._until_finished(demand)
         if self.may_move():
             yield from self.master.pause(SETTLE_S)
@@ -339,15 +339,15 @@ class MachineSession:
     def _shut_down(self) -> Procedure[None]:
         """Disable every drive, by RPDO while the cycle runs, and take the nodes out of NMT operational."""
         loop = self.loop
-        loop.steering.is_guarding_enabled = False
+        self.steering.is_guarding_enabled = False
         disabled = True
         if loop.is_running:
             self._step("disabling the axes")
-            if loop.steering.phase is Phase.QUICK_STOP:
+            if self.steering.phase is Phase.QUICK_STOP:
                 yield from self._stands()
-            loop.steering.command(cia402.COMMAND_DISABLE_VOLTAGE)
-            loop.steering.follow(None)
-            loop.steering.phase = Phase.DISABLED
+            self.steering.command(cia402.COMMAND_DISABLE_VOLTAGE)
+            self.steering.follow(None)
+            self.steering.phase = Phase.DISABLED
             off = (State.SWITCH_ON_DISABLED, State.FAULT, State.NOT_READY_TO_SWITCH_ON)
 
             def is_off() -> bool:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import yaml
-from torque_loops import SOFT_FROZEN_DEG, TORQUE_LOOPS
+from torque_loops import put_in_torque
 
 from config.conversion import closure_at_home, five_bar
 from config.loading import load_config
@@ -159,11 +159,8 @@ def _document(rpm: int, curve: Path, is_learning: bool, is_torque_controlled: bo
     if is_learning:
         document["learning"] = {"enabled": True}
     if is_torque_controlled:
-        for name, gains in TORQUE_LOOPS.items():
-            document["axes"][name]["position_loop"] = gains
-        # These loops are softer than the drives': friction keeps the servo axis where it stands for up to 8 counts.
-        document["guard"]["frozen_actual"]["limit_deg"] = SOFT_FROZEN_DEG
-        # And drives that are told no torque go on with the last one.
+        put_in_torque(document)
+        # Drives that are told no torque go on with the last one.
         document["guard"]["sync_lost"]["limit_cycles"] = 6
         for axis in document["axes"].values():
             axis["sync_watchdog"]["cycles"] = 12
