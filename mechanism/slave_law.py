@@ -16,6 +16,7 @@ from mechanism.law_proof import (
     GRID_MARGIN,
     PASS_POINTS,
     Excess,
+    Float,
     LawLimits,
     LawProof,
     LawState,
@@ -24,12 +25,13 @@ from mechanism.law_proof import (
     Strained,
     Work,
     finish,
+    law_at,
 )
 from mechanism.motion import MasterPlan, plan_stop
 from mechanism.smooth import bend_of_smooth, peaks_of_smooth, shortest_smooth_s, smooth
 
 FADE_RAD: Final = 0.1
-"""Shift at which a feed-forward that knows the cam alone has faded out."""
+"""Shift at which what has been learned of the cam alone has faded out."""
 WINDOW_POINTS: Final = 2 * PASS_POINTS
 CAM_POINTS: Final = 32 * PASS_POINTS
 WINDOWS: Final = tuple(radians(window) for window in range(10, 361, 5))
@@ -79,6 +81,9 @@ class SlaveLaw:
             )
             self._cam_speed = max(speed, fastest)
         self._proved_speed: float = self._cam_speed
+        self._array = LawState().to_array()
+        # The first call loads the machine code, which must not happen within a cycle.
+        law_at(cam.coefficients, cam.net_turns, self._array, 0.0)
 
     @property
     def cam(self) -> CamProfile:
@@ -97,28 +102,48 @@ class SlaveLaw:
 
     def at(self, theta2: float) -> tuple[float, float]:
         """theta5 and its derivative with respect to theta2, rad."""
-        theta5, slope, _, _ = self._cam.at(theta2 + self.shift)
-        if self.is_plain or (self._weight == 0.0 and self._weight_to == 0.0):
-            return theta5 + self._base, slope
-        weight, rate = self._weight_at(theta2)
-        away = self._park - theta5
-        return theta5 + weight * away + self._base, slope * (1.0 - weight) + rate * away
-
-    def plainness(self, theta2: float) -> float:
-        """1 on the cam itself, 0 where what is known of the cam does not hold: a factor for feed-forward."""
-        if self.is_plain:
-            return 1.0
-        return (1.0 - self._weight_at(theta2)[0]) * max(1.0 - abs(self.shift) / FADE_RAD, 0.0)
-
-    def step(self, theta2: float, period_s: float) -> tuple[float, float, float]:
-        """``advance``, then ``at`` and ``plainness`` there."""
         if self.is_plain:
             theta5, slope, _, _ = self._cam.at(theta2)
-            theta5 += self._base
-            return theta5, slope, 1.0
+        else:
+            theta5, slope, _, _ = law_at(self._cam.coefficients, self._cam.net_turns, self._law_array(), theta2)
+        return theta5 + self._base, slope
+
+    def motion(
+        self, theta2: float, velocity: float, acceleration: float, ahead_s: float = 0.0
+    ) -> tuple[float, float, float]:
+        """theta5 (rad), its velocity and its acceleration with the master in this state (rad, rad/s, rad/s^2), which it
+        reaches ``ahead_s`` from now: a shift under way goes on until then.
+        """
+        law = self._law_array()
+        rate = bend = 0.0
+        if self.is_shifting:
+            law[0], rate, bend = self._shift_at(self._shift_s - self._shift_left_s + ahead_s)
+        theta5, slope, curvature, _ = law_at(self._cam.coefficients, self._cam.net_turns, law, theta2)
+        pace = velocity + rate
+        return theta5 + self._base, slope * pace, curvature * pace * pace + slope * (acceleration + bend)
+
+    def _law_array(self) -> Float:
+        """The law in force as `LawState.to_array` has it; always the same array."""
+        law = self._array
+        law[0], law[1], law[2] = self.shift, self._weight, self._weight_to
+        law[3], law[4] = self._window
+        law[5] = self._park
+        return law
+
+    def plainness(self, theta2: float) -> float:
+        """1 on the cam itself, 0 where what has been learned of the cam does not hold."""
+        if self.is_plain:
+            return 1.0
+        return self.engaged_share(theta2) * max(1.0 - abs(self.shift) / FADE_RAD, 0.0)
+
+    def engaged_share(self, theta2: float) -> float:
+        """1 - w: 1 on the cam, shifted or not, 0 parked."""
+        return 1.0 - self._weight_at(theta2)
+
+    def step(self, theta2: float, period_s: float) -> tuple[float, float]:
+        """``advance``, then ``at``."""
         self.advance(theta2, period_s)
-        theta5, slope = self.at(theta2)
-        return theta5, slope, self.plainness(theta2)
+        return self.at(theta2)
 
     def advance(self, theta2: float, period_s: float) -> None:
         """One cycle has passed, the master is at theta2 (rad)."""
@@ -271,13 +296,11 @@ class SlaveLaw:
             return [before]
         return [before, Piece(state, start, end - start, WINDOW_POINTS), Piece(_arrived(state), end)]
 
-    def _weight_at(self, theta2: float) -> tuple[float, float]:
+    def _weight_at(self, theta2: float) -> float:
         start, end = self._window
         if end == inf:
-            return self._weight, 0.0
-        share, rate = smooth((theta2 - start) / (end - start))
-        change = self._weight_to - self._weight
-        return self._weight + change * share, change * rate / (end - start)
+            return self._weight
+        return self._weight + (self._weight_to - self._weight) * smooth((theta2 - start) / (end - start))[0]
 
     def _need_proof(self) -> LawProof:
         if self._proof is None:

@@ -161,7 +161,7 @@ class CamDemand:
         self._step += 1
         at_s = self._step * self._period_s
         position, velocity, self._acceleration = plan.at(at_s)
-        theta5, slope, plainness = self.law.step(position, self._period_s)
+        theta5, slope = self.law.step(position, self._period_s)
         self.master_position = position
         self.master_velocity = velocity
         self.velocities = [velocity, slope * (velocity + self.law.shift_velocity)]
@@ -178,7 +178,7 @@ class CamDemand:
             for number, away in enumerate(self._approach):
                 self.targets[number] = wrap_counts(self.targets[number] + round(share * away))
         if self._torques is not None:
-            self.torque_offsets = self._torques.at(position, velocity, self._acceleration, (1.0 - share) * plainness)
+            self.torque_offsets = self._torques.at(position, velocity, self._acceleration, self.law, 1.0 - share)
         phase = PHASE_OF_PLAN[plan.phase_at(at_s)]
         if phase is Phase.STANDSTILL and self.law.is_shifting:
             # The slave moves even so, and is to be guarded.

@@ -23,6 +23,7 @@ from gateway.errors import GatewayError
 from gateway.learning.law import LearnedTorque, Learning
 from gateway.units import INT16_MAX, AxisUnits
 from mechanism.cam_profile import CamProfile
+from mechanism.slave_law import SlaveLaw
 
 TORQUE_GRID: Final = 1024
 
@@ -70,27 +71,36 @@ class TorqueOffsets:
         """What has been learned until now, a copy; None if nothing has."""
         return None if self._learning is None else self._learning.learned
 
-    def torques(self, position: float, velocity: float, acceleration: float) -> tuple[float, float]:
-        """Torques of master and slave (N m) for this state of the master (rad, rad/s, rad/s^2)."""
+    def at(self, position: float, velocity: float, acceleration: float, law: SlaveLaw, share: float = 1.0) -> list[int]:
+        """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``.
+
+        ``law`` is where the slave is. The model holds on a shifted cam, what has been learned does not. A parked slave
+        is told no torque: its target stands, and a resolver that dies then shows by the load alone, which its
+        controller holds.
+        """
+        lead = self._lead_s
+        position += lead * (velocity + 0.5 * lead * acceleration)
+        velocity += lead * acceleration
         master = slave = 0.0
-        if self._feed_forward is not None:
+        if self._feed_forward is None:
+            pass
+        elif law.is_plain:
             master, slave = self._feed_forward.torques(position, velocity, acceleration)
+        else:
+            theta5, omega5, alpha5 = law.motion(position, velocity, acceleration, lead)
+            torques = self._feed_forward.torques_of_motion(position, theta5, velocity, omega5, acceleration, alpha5)
+            engaged = law.engaged_share(position)
+            master, slave = engaged * torques[0], engaged * torques[1]
         if self._learning is not None:
             learned = self._learning.torques(position, velocity)
-            master += learned[0]
-            slave += learned[1]
+            plainness = law.plainness(position)
+            master += plainness * learned[0]
+            slave += plainness * learned[1]
         limit2, limit5 = self._limits
         if not -limit2 <= master <= limit2:
             master = copysign(limit2, master)
         if not -limit5 <= slave <= limit5:
             slave = copysign(limit5, slave)
-        return master, slave
-
-    def at(self, position: float, velocity: float, acceleration: float, share: float = 1.0) -> list[int]:
-        """Offsets to be sent with the target of this state of the master (rad, rad/s, rad/s^2), times ``share``."""
-        lead = self._lead_s
-        ahead = position + lead * (velocity + 0.5 * lead * acceleration)
-        master, slave = self.torques(ahead, velocity + lead * acceleration, acceleration)
         units = self._units
         return [units[0].permille(share * master), units[1].permille(share * slave)]
 

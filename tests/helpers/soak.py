@@ -41,7 +41,6 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
             judge = Judge(rig, session)
             found = judge.judge()
             tally.take(seed, session, judge)
-            is_torn = rig.plant.torn_at_s is not None
             rig.settle(session, is_reference_doubtful=bool(judge.unheld))
             # A linkage that nobody could hold may stand where no run can begin.
             rig.is_ready = judge.leaves_a_start
@@ -51,7 +50,7 @@ def run_campaign(seed: int, tally: Tally, is_telling: bool = False) -> None:
                 if is_telling:
                     print(tell, judge.figures, sep="\n    ", file=sys.stderr)
             tally.violations += [f"{one} [{tell}] -- {command(seed)}" for one in found]
-            if is_torn:
+            if session.is_torn:
                 # A torn linkage is not mended by hand.
                 break
     except Exception:
@@ -74,14 +73,15 @@ def command(seed: int) -> str:
 
 
 def soak(hours: float, first_seed: int, stride: int, say: Any = None, is_stopping: Any = lambda: False) -> Tally:
-    """Campaigns one after the other until so many hours under guard are reached; ``say(tally)`` about once a minute."""
+    """Campaigns one after the other until so many hours under guard are reached and it can be told whether anything
+    was left behind; ``say(tally)`` about once a minute."""
     tally, leaks, seed = Tally(), LeakWatch(), first_seed
     if hours >= 1.0:
         # So that what is kept for good is there before anything is counted.
         for text in gateway_texts():
             proved_law(text)
     noted_s, since_s = time.monotonic(), time.process_time()
-    while tally.guarded_s < hours * 3600.0 and not is_stopping():
+    while (tally.guarded_s < hours * 3600.0 or not leaks.is_telling) and not is_stopping():
         run_campaign(seed, tally)
         seed += stride
         tally.processor_s = time.process_time() - since_s

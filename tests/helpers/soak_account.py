@@ -7,6 +7,7 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from numba.core import event as numba_event
 from soak_judge import Figures, Judge
 from soak_scenario import Moment
 from soak_session import Session
@@ -17,6 +18,7 @@ IDLE = (Phase.COMMISSIONING, Phase.DISABLED)
 STANDING = (*IDLE, Phase.STANDSTILL)
 GROWTH_OBJECTS = 200
 GROWTH_KIB = 16 * 1024
+LEAST_COUNTS = 3
 NOTHING = "nothing"
 UNKNOWN = dict.fromkeys(
     ("least_sine", "running_deg", "cam_deg", "effector_mm", "rest_s", "torque_off_s", "shaft_torque_Nm"), math.nan
@@ -139,17 +141,46 @@ class Tally:
         self.rss_kib = max(self.rss_kib, other.rss_kib, key=lambda pair: pair[1] - pair[0])
 
 
+class Compilations(numba_event.Listener):
+    """Counts the kernels that numba compiles: each leaves some thousand objects behind, once and for good."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        numba_event.register("numba:compile", self)
+
+    def on_start(self, event: numba_event.Event) -> None:
+        self.count += 1
+
+    def on_end(self, event: numba_event.Event) -> None:
+        pass
+
+
+COMPILATIONS = Compilations()
+
+
 class LeakWatch:
-    """Counts objects by their type, and the process' memory, between two campaigns, when no machine is alive."""
+    """Counts objects by their type, and the process' memory, between two campaigns, when no machine is alive.
+
+    It begins anew when a kernel was compiled since the last count, as a rare campaign is the first to need one.
+    """
 
     def __init__(self, objects: int = GROWTH_OBJECTS) -> None:
         """``objects``: so many more of a type are not yet a leak."""
         self._objects = objects
         self._counts: list[Counter[str]] = []
         self._rss_kib: list[int] = []
+        self._compilations = COMPILATIONS.count
+
+    @property
+    def is_telling(self) -> bool:
+        """Whether it was counted often enough to tell a leak."""
+        return len(self._counts) >= LEAST_COUNTS
 
     def note(self) -> None:
         """Count now."""
+        if COMPILATIONS.count != self._compilations:
+            self._compilations = COMPILATIONS.count
+            self._counts, self._rss_kib = [], []
         gc.collect()
         self._counts.append(Counter(type(thing).__qualname__ for thing in gc.get_objects()))
         self._rss_kib.append(rss_kib())
@@ -159,9 +190,9 @@ class LeakWatch:
 
     def growth(self) -> dict[str, int]:
         """Types of which the least in the last third is more than the most in the first third, by so many."""
-        third = len(self._counts) // 3
-        if third == 0:
+        if not self.is_telling:
             return {}
+        third = len(self._counts) // 3
         first, last = self._counts[:third], self._counts[-third:]
         grown: dict[str, int] = {}
         for name in set().union(*last):

@@ -25,13 +25,13 @@ QUICK_BOUND_DEG = 16.0
 """Of a slave that has torque, sees, and is told where the master is: a brake stops a lost master faster than it can."""
 LOST_BOUND_DEG = 26.0
 """20 deg of the machine that the gateway knows: one axis stands at once, the other one as fast as its limits allow."""
-LOST_OF_TWO_BOUND_DEG = 30.0
+LOST_OF_TWO_BOUND_DEG = 35.0
 """If something else has gone wrong as well."""
 DEAF_BOUND_DEG = 34.0
 """A slave whose drive hears nothing is told by `cam_window`, 20 deg, and its master has to be stopped then."""
 BOTH_LOST_BOUND_DEG = 60.0
 """Each axis has failed by itself: nobody is left who could follow."""
-FROZEN_AT_REST_BOUND_DEG = 75.0
+FROZEN_AT_REST_BOUND_DEG = 85.0
 FROZEN_AT_REST_SINE = 0.5
 """A servo axis whose resolver dies while the demand says nothing sinks until its torque goes unanswered."""
 LATE_IN_TORQUE_BOUND_DEG = 40.0
@@ -60,6 +60,8 @@ ORDERS = tuple(ORDER_OF)
 FRAMES = (FaultKind.LATE_FRAMES, FaultKind.REORDERED_FRAMES, FaultKind.LOST_FRAMES, FaultKind.DOUBLED_FRAMES)
 FATAL = (*TRIPS, *RESTARTS, FaultKind.BUS_OFF, FaultKind.FROZEN_RESOLVER)
 """The axis cannot be relied on afterwards."""
+LOST = (*FATAL, FaultKind.JUMPING_RESOLVER)
+"""Nor while its resolver shows something else: if the other axis fails then, nobody knows whom to follow."""
 SEEN_LEAP_COUNTS = {CV: 26, SERVO: 45}
 """Twice the velocity limit of an axis, and noise: whatever leaps farther is known to have leapt."""
 
@@ -212,8 +214,6 @@ class Judge:
         session = self.session
         if session.killed_ns is None and not session.is_done:
             self._say("the session does not end")
-        if self.rig.machine.plant.torn_at_s is not None and not self.unheld:
-            self._say("the linkage is torn")
         if self.rig.is_powered:
             self._say("a drive has torque after the session")
         angles = np.array(self.rig.plant.ticks[-200:])
@@ -262,6 +262,8 @@ class Judge:
     def judge_truth(self) -> list[str]:
         """After the machine has been settled: do its drives know where they are, and has the gateway told the truth."""
         found: list[str] = []
+        if self.session.is_torn and not self.unheld:
+            found.append("the linkage is torn")
         away = self.session.truth_error_counts
         if away > TRUTH_BOUND_COUNTS and not self.unheld:
             found.append(f"a homed axis is {away} counts from where its drive says that it is")
@@ -317,7 +319,7 @@ class Judge:
         bound = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
         if self.is_frozen_at_rest:
             bound = FROZEN_AT_REST_BOUND_DEG
-        if {CV, SERVO} <= {fault.node_id for fault, _ in self.faults if fault.kind in FATAL}:
+        if {CV, SERVO} <= {fault.node_id for fault, _ in self.faults if fault.kind in LOST}:
             bound = BOTH_LOST_BOUND_DEG
         if any(fault.kind in FRAMES and fault.node_id == SERVO for fault, _ in self.faults):
             bound = max(bound, DEAF_BOUND_DEG)

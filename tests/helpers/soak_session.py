@@ -173,6 +173,8 @@ class Session:
     is_done: bool = False
     truth_error_counts: int = 0
     """Greatest difference between a homed axis' count and where it really is, after the session."""
+    is_torn: bool = False
+    """The linkage, in the session or while its last faults came to their end."""
     unhomed: tuple[int, ...] = ()
     """Axes that have no reference after the session."""
     demanded: list[tuple[int, int]] = field(default_factory=list)
@@ -265,6 +267,7 @@ class Rig:
             self._look_on(None, 0.1)
         self._look_on(None, 0.5)
         session.truth_error_counts = self._truth_error()
+        session.is_torn = self.plant.torn_at_s is not None
         outcomes = [event for event in session.events if isinstance(event, AxisRecovered)]
         session.unhomed = tuple(n for n, axis in enumerate(self.machine.drive_axes) if not axis.is_homed)
         is_ready = session.core.failure is None and all(event.is_ready for event in outcomes)

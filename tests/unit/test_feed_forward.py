@@ -26,6 +26,7 @@ from mechanism.cam_profile import CamProfile
 from mechanism.dynamics import Dynamics, DynamicsParameters, LinkParameters
 from mechanism.five_bar import Closure, FiveBar
 from mechanism.motion import plan_run
+from mechanism.slave_law import SlaveLaw
 
 PAPER = load_config("paper")
 NOTHING = LinkParameters(0.0, 0.0, 0.0, 0.0)
@@ -101,15 +102,16 @@ def test_offsets_are_those_of_the_lead_later_within_the_bound(cam):
     model = build_feed_forward(PAPER, cam)
     ahead = TorqueOffsets((UNITS, UNITS), (9.0, 9.0), 0.001, model)
     now = TorqueOffsets((UNITS, UNITS), (9.0, 9.0), 0.0, model)
-    position, velocity, acceleration = 5.2, 6.0, 10.0
-    later = now.at(position + 0.001 * 6.0 + 0.5e-6 * 10.0, velocity + 0.01, acceleration)
-    assert ahead.at(position, velocity, acceleration) == later
+    position, velocity, acceleration, plain = 5.2, 6.0, 10.0, SlaveLaw(cam)
+    later = now.at(position + 0.001 * 6.0 + 0.5e-6 * 10.0, velocity + 0.01, acceleration, plain)
+    assert ahead.at(position, velocity, acceleration, plain) == later
     assert later == [round(t * 1000 / 1.5) for t in model.torques(5.206005, 6.01, 10.0)]
     bounded = TorqueOffsets((UNITS, UNITS), (0.3, 0.03), 0.0, model)
     assert all(abs(offset) > bound for offset, bound in zip(later, (200, 20), strict=True))
-    assert [abs(offset) for offset in bounded.at(position, velocity, acceleration)] == [200, 20]
+    assert [abs(offset) for offset in bounded.at(position, velocity, acceleration, plain)] == [200, 20]
 
 
+SWINGING = SlaveLaw(swinging(0.8))
 FIRM = TorqueOffsets(
     (UNITS, UNITS), (4.5, 4.5), 0.001, FeedForward(nominal_parameters(PAPER), Closure.LEFT, swinging(0.8), 0.1)
 )
@@ -117,7 +119,7 @@ FIRM = TorqueOffsets(
 
 @given(st.floats(-1e4, 1e4), st.floats(-100, 100), st.floats(-1e4, 1e4), st.floats(0, 1))
 def test_no_motion_makes_an_offset_that_is_no_integer16_within_the_bound(position, velocity, acceleration, share):
-    offsets = FIRM.at(position, velocity, acceleration, share)
+    offsets = FIRM.at(position, velocity, acceleration, SWINGING, share)
     assert all(type(offset) is int and abs(offset) <= 3000 for offset in offsets)
 
 
@@ -219,7 +221,7 @@ class Shown:
     def __init__(self):
         self.steady = []
 
-    def at(self, position, velocity, acceleration, share):
+    def at(self, position, velocity, acceleration, law, share):
         return [0, 0]
 
     def observe(self, position, velocity, errors, is_steady):

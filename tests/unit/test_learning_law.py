@@ -16,6 +16,7 @@ from gateway.learning.law import LearnedTorque, Learning, LearningSettings, mass
 from gateway.running.preparation import compile_config
 from gateway.units import AxisUnits
 from mechanism.dynamics import mass_matrix_and_bias
+from mechanism.slave_law import SlaveLaw
 
 SPEED = math.tau
 CYCLE_S = 0.001
@@ -232,7 +233,8 @@ def test_the_observer_shows_counts_as_angles():
         position += SPEED * CYCLE_S
     expected = (0.5 * 40.0 * 2 * math.tau / 4096, -0.5 * 20.0 * math.tau / 1024)
     assert learning.torques(1.0, SPEED) == pytest.approx(expected)
-    assert offsets.at(1.0, SPEED, 0.0) == [round(torque * 1000 / 1.5) for torque in expected]
+    plain = SlaveLaw(compile_config(load_config("paper")).profile)
+    assert offsets.at(1.0, SPEED, 0.0, plain) == [round(torque * 1000 / 1.5) for torque in expected]
     assert np.array_equal(offsets.learned.torque, learning.learned.torque)
 
 

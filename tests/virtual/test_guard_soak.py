@@ -4,10 +4,12 @@
 is ``make soak``.
 """
 
+import math
 import os
 import re
 from random import Random
 
+import numba
 import pytest
 import soak
 import yaml
@@ -126,6 +128,19 @@ def test_what_is_left_behind_at_every_campaign_is_found_and_what_comes_and_goes_
         watch.note()
     assert watch.growth() == {"Kept": 300}
     assert len(passing) == 400
+
+
+@pytest.mark.slow
+def test_a_kernel_compiled_for_a_rare_campaign_is_not_a_leak_and_does_not_hide_one():
+    watch, kept, is_telling = LeakWatch(), [], []
+    for number in range(7):
+        kept += [Kept() for _ in range(100)]
+        if number == 2:
+            numba.njit(lambda x: math.hypot(x, 1.0) + max(x, 2.0))(3.0)
+        watch.note()
+        is_telling.append(watch.is_telling)
+    assert is_telling == [False] * 4 + [True] * 3
+    assert watch.growth() == {"Kept": 400}
 
 
 @pytest.mark.slow
