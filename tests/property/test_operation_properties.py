@@ -220,6 +220,56 @@ def test_a_window_is_proved_for_the_speed_that_the_master_still_has():
     assert machine.order(Order.DISENGAGE, 100.0) == ""
 
 
+class Told(Operated):
+    """Asks the law, a step before and at every step, how the slave moves there."""
+
+    def __init__(self):
+        super().__init__()
+        self.told = []
+
+    def step(self):
+        demand = self.demand
+        ahead = self.law.motion(*demand._plan.at((demand._step + 1) * PERIOD_S), PERIOD_S)
+        super().step()
+        now = self.law.motion(demand.master_position, demand.master_velocity, demand._acceleration)
+        self.told.append((*now, *ahead))
+
+
+def test_the_motion_that_the_feed_forward_is_told_is_that_of_the_demand():
+    """A phase shift, one stopped on its way, the slave leaving its cam and coming back, under way and in a ramp."""
+    machine = Told().to_speed()
+    machine.told.clear()
+    for order, value, seconds in (
+        (Order.PHASE_SHIFT, -6.0, 0.9),
+        (Order.OVERRIDE, 50.0, 0.5),
+        (Order.PHASE_SHIFT, 3.0, 0.2),
+        (None, 0.0, 0.4),
+        (Order.DISENGAGE, 100.0, 3.0),
+        (Order.ENGAGE, 200.0, 4.0),
+    ):
+        if order is None:
+            machine.law.halt_shift()
+        else:
+            assert machine.order(order, value) == ""
+        machine.go(seconds)
+    assert -6.0 < math.degrees(machine.law.shift) < 3.0
+    assert not machine.law.is_shifting
+    theta5 = np.array(machine.angles)[1:, 1]
+    at, velocity, acceleration, *ahead = np.array(machine.told).T
+    assert at == pytest.approx(theta5, abs=1e-12)
+    by_differences = np.gradient(theta5, PERIOD_S)
+    assert velocity[2:-2] == pytest.approx(by_differences[2:-2], abs=0.01)
+    by_differences = np.gradient(by_differences, PERIOD_S)
+    # Where the cam's jerk jumps, from one of its pieces to the next, differences of the second order do not hold.
+    assert acceleration[2:-2] == pytest.approx(by_differences[2:-2], abs=20.0)
+    assert np.quantile(np.abs(acceleration - by_differences)[2:-2], 0.95) < 0.1
+    assert np.abs(velocity).max() > 10.0
+    assert np.abs(acceleration).max() > 200.0
+    # Whoever asks a step before is told the same, but where an order or the law's own end comes in between.
+    amiss = np.abs(np.array(ahead) - (at, velocity, acceleration)) > [[1e-9], [1e-6], [1e-3]]
+    assert np.count_nonzero(amiss.any(axis=0)) <= 8
+
+
 jogs = st.lists(st.tuples(st.floats(-15.0, 15.0), st.floats(0.05, 1.5)), min_size=2, max_size=6)
 
 

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from config.conversion import (
+    closure_at_home,
     controller_gains,
     drive_damping,
     nominal_parameters,
@@ -20,11 +21,13 @@ from gateway.cyclic.feed_forward import FeedForward
 from gateway.cyclic.torque_offsets import TorqueOffsets, build_feed_forward, build_torque_offsets, torque_lead_s
 from gateway.errors import GatewayError
 from gateway.running.drive_settings import axis_units
+from gateway.running.operation_setup import slave_law
 from gateway.running.preparation import compile_config, plan, prepare
 from gateway.units import AxisUnits
 from mechanism.cam_profile import CamProfile
 from mechanism.dynamics import Dynamics, DynamicsParameters, LinkParameters
 from mechanism.five_bar import Closure, FiveBar
+from mechanism.law_proof import Pace, finish
 from mechanism.motion import plan_run
 from mechanism.slave_law import SlaveLaw
 
@@ -109,6 +112,36 @@ def test_offsets_are_those_of_the_lead_later_within_the_bound(cam):
     bounded = TorqueOffsets((UNITS, UNITS), (0.3, 0.03), 0.0, model)
     assert all(abs(offset) > bound for offset, bound in zip(later, (200, 20), strict=True))
     assert [abs(offset) for offset in bounded.at(position, velocity, acceleration, plain)] == [200, 20]
+
+
+def test_a_shifted_slave_is_fed_the_torque_of_where_it_is_and_a_parked_one_none(cam):
+    law = slave_law(PAPER, cam)
+    finish(law.change_shift(0.2, math.tau, Pace(math.tau, 2.0, 30.0, 500.0)))
+    while law.is_shifting:
+        law.advance(1.0, 0.001)
+    model = build_feed_forward(PAPER, cam)
+    offsets = TorqueOffsets((UNITS, UNITS), (9.0, 9.0), 0.0, model)
+    theta2, omega2, alpha2 = 5.3, 6.0, 10.0
+    theta5, slope, curvature, _ = cam.at(theta2 + 0.2)
+    alpha5 = curvature * omega2**2 + slope * alpha2
+    parameters = nominal_parameters(PAPER)
+    expected = Dynamics(parameters, closure_at_home(PAPER)).torque(
+        (theta2, theta5), (omega2, slope * omega2), (alpha2, alpha5), PAPER.feed_forward.coulomb_velocity_rad_per_s
+    )
+    damping = drive_damping(PAPER, "cv") * omega2, drive_damping(PAPER, "servo") * slope * omega2
+    fed = [round((torque - own) * 1000 / 1.5) for torque, own in zip(expected, damping, strict=True)]
+    assert offsets.at(theta2, omega2, alpha2, law) == fed
+    assert abs(fed[1] - offsets.at(theta2, omega2, alpha2, SlaveLaw(cam))[1]) > 50
+    engagement = finish(law.prove_engagement(False, 1.0, 0.0, math.tau))
+    law.engage(engagement, theta2)
+    window = engagement.state.end - engagement.state.start
+    middle = 1.0 + math.tau + window / 2.0
+    law.advance(middle, 0.001)
+    theta5, omega5, alpha5 = law.motion(middle, omega2, alpha2)
+    half = [torque / 2.0 for torque in model.torques_of_motion(middle, theta5, omega2, omega5, alpha2, alpha5)]
+    assert offsets.at(middle, omega2, alpha2, law) == [round(torque * 1000 / 1.5) for torque in half]
+    law.advance(middle + window, 0.001)
+    assert offsets.at(middle + window, omega2, alpha2, law) == [0, 0]
 
 
 SWINGING = SlaveLaw(swinging(0.8))

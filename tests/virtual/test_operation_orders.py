@@ -140,6 +140,17 @@ def test_a_phase_shift_moves_the_slave_along_its_cam_and_back():
     assert run.trips == []
 
 
+@pytest.mark.parametrize("degrees", [-6.0, pytest.param(6.0, marks=pytest.mark.slow)])
+def test_a_shifted_slave_is_fed_forward_as_on_its_cam(degrees):
+    """Behind soft loops it lagged by 43 counts in the return stroke, of 2 on the cam itself."""
+    run = Operated(cycles=2, config=machine_in_torque()).order(at_theta2(10), Order.PHASE_SHIFT, degrees).to_end()
+    assert run.refusals == [""]
+    samples = samples_of(run)
+    errors = np.abs(samples["position_demand"] - samples["position_actual"])[samples["phase"] == Phase.CAM]
+    assert len(errors) > 1500
+    assert np.all(errors.max(axis=0) <= [2, 3])
+
+
 @pytest.mark.slow
 def test_the_slave_leaves_its_cam_at_an_angle_and_returns_at_another():
     run = Operated(cycles=3).order(at_theta2(180), Order.DISENGAGE, 200.0)
