@@ -1,11 +1,13 @@
 """One axis as the cycle sees it."""
 
 import math
+from dataclasses import dataclass
 from typing import Final
 
 from drivers.cia402 import COMMAND_DISABLE_VOLTAGE
 from drivers.pdo import RPDO_BASE, TPDO_BASE
 from gateway.cyclic.position_loop import PositionLoop
+from gateway.record.sample import INT32_MAX
 from gateway.units import AxisUnits
 
 LEAP_GAP_CYCLES: Final = 2
@@ -79,3 +81,20 @@ class AxisChannel:
             return False
         self.leapt += round(moved - expected)
         return True
+
+
+@dataclass(frozen=True, slots=True)
+class AxisLimits:
+    """What is guarded of one axis; the following error's limit is the channel's own."""
+
+    velocity_counts_per_cycle: float
+    torque_permille: int
+    frozen_counts: int
+    """Travel of the demand while the actual value stays the same."""
+    unanswered_permille: int
+    """Change of torque while the actual value stays the same."""
+    pushed_permille: int
+    """The same, if it lasts; see `answer.PUSHED_CYCLES`."""
+
+
+NO_LIMITS: Final = AxisLimits(float("inf"), INT32_MAX, INT32_MAX, INT32_MAX, INT32_MAX)

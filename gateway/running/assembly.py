@@ -7,7 +7,8 @@ from typing import Final
 from config.conversion import closure_at_home, five_bar, nominal_parameters
 from config.schema import GatewayConfig
 from gateway.cyclic.approach import Approach, ApproachDemand, ApproachLimits
-from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.axis_channel import AxisChannel, AxisLimits
+from gateway.cyclic.cam_window import CamWindow
 from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.demand import CamDemand
 from gateway.cyclic.free_motion import FreeMotion
@@ -17,7 +18,7 @@ from gateway.cyclic.operation import Operation
 from gateway.cyclic.reactions import CoupledStop
 from gateway.cyclic.steering import Steering
 from gateway.cyclic.torque_offsets import build_torque_offsets
-from gateway.cyclic.watch import AxisLimits, CamWindow, CycleWatch
+from gateway.cyclic.watch import CycleWatch
 from gateway.learning.law import Learning, build_learning
 from gateway.running.core import GatewayCore
 from gateway.running.drive_settings import (

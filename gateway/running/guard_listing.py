@@ -17,8 +17,8 @@ from config.guard_section import (
     TorqueCondition,
 )
 from config.schema import AxisSection, GatewayConfig
+from gateway.cyclic.answer import PUSHED_CYCLES
 from gateway.cyclic.guard import Condition, persistence_cycles
-from gateway.cyclic.watch import PUSHED_CYCLES
 from gateway.running.drive_settings import lasting_pushes
 
 

@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 
 from config.schema import GuardSection
 from drivers.nmt import SYNC_COB_ID
-from gateway.cyclic.axis_channel import AxisChannel
+from gateway.cyclic.axis_channel import AxisChannel, AxisLimits
 from gateway.cyclic.cycle import CyclicLoop
 from gateway.cyclic.guard import Condition, Guard
 from gateway.cyclic.steering import Steering
-from gateway.cyclic.watch import AxisLimits, CycleWatch
+from gateway.cyclic.watch import CycleWatch
 from gateway.record.sample import INT32_MAX, Phase, SampleFlag
 from gateway.units import AxisUnits
 

@@ -9,9 +9,9 @@ import pytest
 from config.guard_section import Reaction
 from config.loading import ConfigError, load_config, parse_config
 from drivers.virtual_time import VirtualBus
-from gateway.cyclic.axis_channel import RARE_CYCLES, AxisChannel
+from gateway.cyclic.axis_channel import NO_LIMITS, RARE_CYCLES, AxisChannel, AxisLimits
 from gateway.cyclic.guard import REASON_OF, Condition, Guard, StopReason
-from gateway.cyclic.watch import NO_LIMITS, AxisLimits, CycleWatch
+from gateway.cyclic.watch import CycleWatch
 from gateway.record.sample import Phase
 from gateway.running.assembly import build_core, guard_limits, slave_law
 from gateway.running.preparation import compile_config, prepare
