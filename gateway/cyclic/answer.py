@@ -15,6 +15,8 @@ PUSHED_CYCLES: Final = 80
 """An integrator pushes slowly, and an axis that nobody sees is the faster for it: for so long less is as bad."""
 DRIVING_SHARE: Final = 3
 """So many times the torque that must not go unanswered is more than any load that an axis stands under."""
+LATE_CYCLES: Final = 20
+"""A drive whose demands come late has them all the same after so long, or has to be stopped."""
 PASSING_CYCLES: Final = 4
 """For so long a slow axis stands on every count; what it does meanwhile is not asked for."""
 STILL_CYCLES: Final = (8, 16, 24)
@@ -32,6 +34,7 @@ class AnswerWatch:
         "_free_motion",
         "_frozen_counts",
         "_guard",
+        "_late_cycles",
         "_nearest",
         "_number",
         "_pushed",
@@ -62,6 +65,8 @@ class AnswerWatch:
         """Counts that the demand has been nearest to the actual value since that changed last."""
         self._still_cycles = 0
         """Cycles since the actual value changed last."""
+        self._late_cycles = 0
+        """Cycles of them in which its demand came too late."""
         self._still_torques = [(0, 0)] * len(STILL_CYCLES)
         """Torque actual value and torque offset then."""
         self._pushed_cycles = 0
@@ -75,6 +80,7 @@ class AnswerWatch:
         self.is_standing = False
         self._nearest = INT32_MAX
         self._still_cycles = 0
+        self._late_cycles = 0
 
     def let_settle(self) -> None:
         """It has been left without a demand, and has to be set in motion anew: until then it may stand."""
@@ -83,13 +89,24 @@ class AnswerWatch:
     def stands(self, target: int, target_before: int, has_moved: bool, now_ns: int) -> bool:
         """Look at a cycle's target (counts); returns whether the axis stands on one count, and that says something."""
         guard, number = self._guard, self._number
-        if has_moved or (not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0)):
-            # A drive that has had no new target stands, whatever its resolver shows.
+        if has_moved:
             self.has_moved()
             if not guard.is_quiet:
                 guard.clear(Condition.FROZEN_ACTUAL, number)
                 guard.clear(Condition.UNANSWERED_TORQUE, number)
             return False
+        if not guard.is_quiet and guard.is_holding(Condition.MISSED_DEADLINE, 0):
+            self._late_cycles += 1
+            if self._late_cycles <= LATE_CYCLES:
+                # A drive that has had no new target stands, whatever its resolver shows; but not if it drives.
+                self.is_standing = True
+                self._nearest = INT32_MAX
+                self._still_cycles = 0
+                guard.clear(Condition.FROZEN_ACTUAL, number)
+                self.check_drive_to(target, now_ns)
+                return False
+        elif target == target_before:
+            self._late_cycles = 0
         if self._settling:
             self._settling -= 1
             return False
@@ -143,8 +160,8 @@ class AnswerWatch:
             guard.clear(Condition.UNANSWERED_TORQUE, number)
 
     def check_drive_to(self, target: int, now_ns: int) -> None:
-        """Of an axis that ``stands`` in a stop: torques have nothing to be compared with there, but what drives it
-        towards a target far away moves it.
+        """Of an axis that stands in a stop, or has been told late where to go: torques have nothing to be compared with
+        there, but what drives it towards a target far away moves it.
         """
         guard, number, axis = self._guard, self._number, self._axis
         error, limit = wrap_counts(target - axis.actual), DRIVING_SHARE * self._unanswered

@@ -29,7 +29,8 @@ LOST_OF_TWO_BOUND_DEG = 35.0
 """If something else has gone wrong as well."""
 DEAF_BOUND_DEG = 34.0
 """A slave whose drive hears nothing is told by `cam_window`, 20 deg, and its master has to be stopped then."""
-BOTH_LOST_BOUND_DEG = 60.0
+BOTH_LOST_BOUND_DEG = 70.0
+BOTH_LOST_SINE = 0.6
 """Each axis has failed by itself: nobody is left who could follow."""
 FROZEN_AT_REST_BOUND_DEG = 85.0
 FROZEN_AT_REST_SINE = 0.5
@@ -60,8 +61,8 @@ ORDERS = tuple(ORDER_OF)
 FRAMES = (FaultKind.LATE_FRAMES, FaultKind.REORDERED_FRAMES, FaultKind.LOST_FRAMES, FaultKind.DOUBLED_FRAMES)
 FATAL = (*TRIPS, *RESTARTS, FaultKind.BUS_OFF, FaultKind.FROZEN_RESOLVER)
 """The axis cannot be relied on afterwards."""
-LOST = (*FATAL, FaultKind.JUMPING_RESOLVER)
-"""Nor while its resolver shows something else: if the other axis fails then, nobody knows whom to follow."""
+LOST = (*FATAL, *FRAMES, FaultKind.JUMPING_RESOLVER)
+"""Nor while it shows something else, or is told only now and then: if the other axis fails then, nobody is followed."""
 SEEN_LEAP_COUNTS = {CV: 26, SERVO: 45}
 """Twice the velocity limit of an axis, and noise: whatever leaps farther is known to have leapt."""
 
@@ -265,7 +266,7 @@ class Judge:
         if self.session.is_torn and not self.unheld:
             found.append("the linkage is torn")
         away = self.session.truth_error_counts
-        if away > TRUTH_BOUND_COUNTS and not self.unheld:
+        if away > TRUTH_BOUND_COUNTS and not self.rig.is_reference_doubtful:
             found.append(f"a homed axis is {away} counts from where its drive says that it is")
         names = self.rig.config.axis_names
         for event in self.session.events:
@@ -313,17 +314,22 @@ class Judge:
             least = min(LEAST_SINE, self._least_commanded_sine() - SINE_LOSS)
         if self.is_frozen_at_rest:
             least = min(least, FROZEN_AT_REST_SINE)
+        if self._are_both_lost():
+            least = min(least, BOTH_LOST_SINE)
         return least
 
     def _lost_bound_deg(self) -> float:
         bound = LOST_BOUND_DEG if len(self.fired) < 2 else LOST_OF_TWO_BOUND_DEG
         if self.is_frozen_at_rest:
             bound = FROZEN_AT_REST_BOUND_DEG
-        if {CV, SERVO} <= {fault.node_id for fault, _ in self.faults if fault.kind in LOST}:
+        if self._are_both_lost():
             bound = BOTH_LOST_BOUND_DEG
         if any(fault.kind in FRAMES and fault.node_id == SERVO for fault, _ in self.faults):
             bound = max(bound, DEAF_BOUND_DEG)
         return max(bound, LATE_IN_TORQUE_BOUND_DEG) if self._is_late_in_torque() else bound
+
+    def _are_both_lost(self) -> bool:
+        return {CV, SERVO} <= {fault.node_id for fault, _ in self.faults if fault.kind in LOST}
 
     def _is_in_torque(self) -> bool:
         return any(axis.position_loop is not None for axis in self.rig.config.ordered_axes)

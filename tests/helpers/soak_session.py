@@ -204,6 +204,8 @@ class Rig:
         self.is_ready = True
         """A run may begin where the linkage stands."""
         self.is_homing_again = False
+        self.is_reference_doubtful = False
+        """An axis may have been homed where it was not, and has not been homed again since."""
         self._source = Random(campaign.seed)
 
     def run(self, plan: SessionPlan) -> Session:
@@ -271,7 +273,11 @@ class Rig:
         outcomes = [event for event in session.events if isinstance(event, AxisRecovered)]
         session.unhomed = tuple(n for n, axis in enumerate(self.machine.drive_axes) if not axis.is_homed)
         is_ready = session.core.failure is None and all(event.is_ready for event in outcomes)
-        self.is_homing_again = not is_ready or bool(session.unhomed) or is_reference_doubtful
+        is_homed_anew = self.is_homing_again and any(
+            isinstance(event, StepReached) and event.step == "enabling the axes" for event in session.events
+        )
+        self.is_reference_doubtful = is_reference_doubtful or (self.is_reference_doubtful and not is_homed_anew)
+        self.is_homing_again = not is_ready or bool(session.unhomed) or self.is_reference_doubtful
         if self.is_homing_again:
             turns = round(self.plant.angle(0) / math.tau) * math.tau
             self.plant.set_motion((turns, 0.0), (0.0, 0.0))
