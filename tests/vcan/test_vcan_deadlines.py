@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import yaml
-from slow_host import slow_host_paper
+from slow_host import LATENESS, slow_host_paper
 
 from drivers.ports import interface_is_up
 
@@ -41,7 +41,16 @@ def machine(tmp_path: Path) -> Path:
     """``paper`` at the bench's cycle, its guards warning only."""
     config = slow_host_paper(())
     config["bus"] |= {"cycle_us": CYCLE_US, "heartbeat_timeout_ms": 2000, "is_virtual": True}
-    warned = ("missed_tpdo", "missed_deadline", "axis_silent", "following_error", "bus_off", "end_effector_error")
+    warned = (
+        *LATENESS,
+        "following_error",
+        "bus_off",
+        "end_effector_error",
+        "velocity",
+        "torque",
+        "cam_window",
+        "frozen_actual",
+    )
     config["guard"] |= {name: {**config["guard"].get(name, {}), "reaction": "warn"} for name in warned}
     config["guard"]["sync_lost"] = {"limit_cycles": 5, "reaction": "warn"}
     config["guard"]["unanswered_torque"] = {"limit_permille": 30000, "reaction": "disable"}
