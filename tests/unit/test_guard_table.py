@@ -153,6 +153,32 @@ def test_an_axis_whose_demands_came_too_late_is_not_taken_for_frozen():
     assert guard.tripped[-1].condition is Condition.FROZEN_ACTUAL
 
 
+def test_demands_that_come_late_for_longer_than_twenty_cycles_are_had_all_the_same():
+    """From cycle 21 on the travel counts, 3 a cycle: 12, more than 11, at cycle 24, held for four cycles."""
+    guard, _, watch = make()
+    check(watch, 0, phase=Phase.CAM)
+    for cycle in range(1, 40):
+        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
+        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+        if any(trip.condition is Condition.FROZEN_ACTUAL for trip in guard.tripped):
+            break
+    assert cycle == 27
+
+
+@pytest.mark.parametrize(("torque", "is_driven"), [(751, True), (750, False), (-751, False)])
+def test_late_demands_excuse_an_axis_that_stands_not_one_that_is_driven(torque, is_driven):
+    """Three times 250 per mille towards a demand that is farther away than it may stand, for eight cycles."""
+    guard, axes, watch = make(AxisLimits(20.5, 2500, 11, 250, 125))
+    axes[1].torque = torque
+    check(watch, 0, phase=Phase.CAM)
+    for cycle in range(1, 19):
+        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
+        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+    tripped = [trip.at_ns for trip in guard.tripped if trip.condition is Condition.UNANSWERED_TORQUE]
+    # 12 counts away at cycle 4.
+    assert tripped == ([11] if is_driven else [])
+
+
 def test_an_axis_that_stands_as_it_should_is_not_frozen_nor_one_that_flickers():
     guard, axes, watch = make()
     assert run(watch, axes, guard, [(100, 100)] * 1000) is None
