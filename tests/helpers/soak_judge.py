@@ -28,7 +28,7 @@ LOST_BOUND_DEG = 26.0
 LOST_OF_TWO_BOUND_DEG = 35.0
 """If something else has gone wrong as well."""
 DEAF_BOUND_DEG = 34.0
-"""A slave whose drive hears nothing is told by `cam_window`, 20 deg, and its master has to be stopped then."""
+"""An axis whose drive hears nothing is told by `cam_window`, 20 deg, and the other one has to be stopped then."""
 BOTH_LOST_BOUND_DEG = 70.0
 BOTH_LOST_SINE = 0.6
 """Each axis has failed by itself: nobody is left who could follow."""
@@ -324,7 +324,7 @@ class Judge:
             bound = FROZEN_AT_REST_BOUND_DEG
         if self._are_both_lost():
             bound = BOTH_LOST_BOUND_DEG
-        if any(fault.kind in FRAMES and fault.node_id == SERVO for fault, _ in self.faults):
+        if any(fault.kind in FRAMES for fault, _ in self.faults):
             bound = max(bound, DEAF_BOUND_DEG)
         return max(bound, LATE_IN_TORQUE_BOUND_DEG) if self._is_late_in_torque() else bound
 
