@@ -78,9 +78,8 @@ class AnswerWatch:
     def has_moved(self) -> None:
         """Its actual value has changed, or nobody knows whether it has."""
         self.is_standing = False
-        self._nearest = INT32_MAX
-        self._still_cycles = 0
         self._late_cycles = 0
+        self._begin_anew()
 
     def let_settle(self) -> None:
         """It has been left without a demand, and has to be set in motion anew: until then it may stand."""
@@ -100,8 +99,7 @@ class AnswerWatch:
             if self._late_cycles <= LATE_CYCLES:
                 # A drive that has had no new target stands, whatever its resolver shows; but not if it drives.
                 self.is_standing = True
-                self._nearest = INT32_MAX
-                self._still_cycles = 0
+                self._begin_anew()
                 guard.clear(Condition.FROZEN_ACTUAL, number)
                 self.check_drive_to(target, now_ns)
                 return False
@@ -119,6 +117,11 @@ class AnswerWatch:
         if travelled > self._frozen_counts:
             guard.hold(Condition.FROZEN_ACTUAL, number, travelled, self._frozen_counts, now_ns)
         return True
+
+    def _begin_anew(self) -> None:
+        """What it has stood until now does not count."""
+        self._nearest = INT32_MAX
+        self._still_cycles = 0
 
     def check_torque(
         self, torque_offset: int, is_foreseen: bool, is_push_told: bool, velocities: Sequence[float], now_ns: int

@@ -82,13 +82,12 @@ class TorqueOffsets:
         position += lead * (velocity + 0.5 * lead * acceleration)
         velocity += lead * acceleration
         master = slave = 0.0
-        if self._feed_forward is None:
-            pass
-        elif law.is_plain:
-            master, slave = self._feed_forward.torques(position, velocity, acceleration)
-        else:
+        model = self._feed_forward
+        if model is not None and law.is_plain:
+            master, slave = model.torques(position, velocity, acceleration)
+        elif model is not None:
             theta5, omega5, alpha5 = law.motion(position, velocity, acceleration, lead)
-            torques = self._feed_forward.torques_of_motion(position, theta5, velocity, omega5, acceleration, alpha5)
+            torques = model.torques_of_motion(position, theta5, velocity, omega5, acceleration, alpha5)
             engaged = law.engaged_share(position)
             master, slave = engaged * torques[0], engaged * torques[1]
         if self._learning is not None:

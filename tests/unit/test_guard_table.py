@@ -119,6 +119,12 @@ def check(watch, cycle, demand=0, awaited=0, phase=Phase.STANDSTILL, offset=0, i
     watch.check(awaited, [0, demand], [0, offset], [0.0, 0.0], 0.0, phase, is_enabled, followers, cycle)
 
 
+def check_late(guard, watch, cycle):
+    """One in motion whose demand, 3 counts farther than the last, came too late."""
+    guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
+    check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+
+
 def run(watch, axes, guard, track, awaited=0, phase=Phase.STANDSTILL):
     """``track``: (demand, actual) of the servo axis by cycle; returns the cycle of the first trip, None for none."""
     for cycle, (demand, actual) in enumerate(track):
@@ -144,8 +150,7 @@ def test_an_axis_whose_demands_came_too_late_is_not_taken_for_frozen():
     guard, _, watch = make()
     check(watch, 0, phase=Phase.CAM)
     for cycle in range(1, 20):
-        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
-        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+        check_late(guard, watch, cycle)
     assert all(trip.condition is not Condition.FROZEN_ACTUAL for trip in guard.tripped)
     guard.clear(Condition.MISSED_DEADLINE, 0)
     for cycle in range(20, 30):
@@ -158,8 +163,7 @@ def test_demands_that_come_late_for_longer_than_twenty_cycles_are_had_all_the_sa
     guard, _, watch = make()
     check(watch, 0, phase=Phase.CAM)
     for cycle in range(1, 40):
-        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
-        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+        check_late(guard, watch, cycle)
         if any(trip.condition is Condition.FROZEN_ACTUAL for trip in guard.tripped):
             break
     assert cycle == 27
@@ -172,8 +176,7 @@ def test_late_demands_excuse_an_axis_that_stands_not_one_that_is_driven(torque, 
     axes[1].torque = torque
     check(watch, 0, phase=Phase.CAM)
     for cycle in range(1, 19):
-        guard.hold(Condition.MISSED_DEADLINE, 0, 1, 1, cycle)
-        check(watch, cycle, 3 * cycle, phase=Phase.CAM)
+        check_late(guard, watch, cycle)
     tripped = [trip.at_ns for trip in guard.tripped if trip.condition is Condition.UNANSWERED_TORQUE]
     # 12 counts away at cycle 4.
     assert tripped == ([11] if is_driven else [])
